@@ -164,13 +164,13 @@ class Asynchronous:
             twist = check_array("twist", twist, (6,))
         if std_m is not None:
             if noise is not None:
-                raise ValueError("std_m and noise say the same: give one")
+                raise ValueError("std_m and noise must not both be given: they set the same law")
             noise = LinkNoise(np.array([[check_number("std_m", std_m, low=1e-9)]]))
         if anchors is not None:
             anchors = check_array("anchors", anchors, ("M", 3))
             if anchors.shape[-2] != len(self.anchors):
                 raise ValueError(
-                    f"anchors must be all {len(self.anchors)}, got shape {anchors.shape}"
+                    f"anchors must hold all {len(self.anchors)} anchors, got shape {anchors.shape}"
                 )
         measured = TimedRange(time, anchor, tag, value, twist, noise, anchors)
         newest = max(time, stream.time)

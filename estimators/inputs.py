@@ -90,7 +90,7 @@ def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArra
         raise ValueError(f"covariance must have shape {wanted}, got {covariance.shape}")
     skew = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
     if skew > _SYMMETRIC * np.abs(covariance).max():
-        raise ValueError(f"covariance must be symmetric, is off by {skew:.3g}")
+        raise ValueError(f"covariance must be symmetric, but its asymmetry is {skew:.3g}")
     smallest = np.linalg.eigvalsh(covariance).min()
     if smallest <= 0:
         raise ValueError(f"covariance must be positive definite, smallest eigenvalue {smallest:g}")
@@ -250,7 +250,7 @@ def epoch_variance(
         if variance.shape != ranges.shape:
             np.broadcast_shapes(variance.shape, ranges.shape)
     except ValueError as error:
-        raise ValueError(f"noise does not fit ranges of shape {ranges.shape}: {error}") from error
+        raise ValueError(f"noise must fit ranges of shape {ranges.shape}: {error}") from error
     return check_variance(variance, links)
 
 
@@ -307,7 +307,7 @@ def check_one_process(process: ProcessNoise) -> ProcessNoise:
     """Return the process noise, or raise ValueError if each trial has its own."""
     if np.ndim(process.std()) > 1:
         raise ValueError(
-            f"process must be that of all trials, as only 'iekf' takes leading axes, got "
-            f"{process.std().shape[:-1]}"
+            "process must be the same for all trials, as only the filter 'iekf' takes leading "
+            f"axes, got {process.std().shape[:-1]}"
         )
     return process

@@ -53,8 +53,8 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
         "log_evidence",
     }:
         raise ValueError(
-            "level must be of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', 'iekf-log'), got a "
-            f"state of {', '.join(fields) or type(predicted).__name__}"
+            "level must be used with a state of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', "
+            f"'iekf-log'), got a state with {', '.join(fields) or type(predicted).__name__}"
         )
     P0, P = before.covariance, predicted.covariance
     Q, t = predicted.rotation, predicted.translation

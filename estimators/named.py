@@ -140,7 +140,7 @@ def iekf_log(
     if clock is not None:
         if odometry is not None or headings != 1 or directions is not None:
             raise ValueError(
-                f"clock must be None beside odometry, headings or directions, got {clock!r:.80}"
+                f"clock must be None with odometry, headings or directions, got {clock!r:.80}"
             )
         filter = ClockEkf(pose, law, None, (stays, moves), clock=clock)
     elif odometry is None:

@@ -83,7 +83,8 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     if covariance.shape[-2:] != (error.shape[-1],) * 2:
         raise ValueError(
-            f"covariance must fit error of {error.shape[-1]} entries, got {covariance.shape}"
+            f"covariance must have shape (..., n, n) for errors of n = {error.shape[-1]} entries, "
+            f"got {covariance.shape}"
         )
     try:
         solved = np.linalg.solve(covariance, error[..., None])[..., 0]

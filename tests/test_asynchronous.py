@@ -187,7 +187,7 @@ def test_anchors_that_move_and_a_deviation_for_every_range():
         t, m, n, value = rows[k]
         stream = links.add(stream, t, m, n, value, std_m=0.05 + 0.01 * n, anchors=places[k])
     same(links.belief(stream), links.filter.belief(state))
-    with pytest.raises(ValueError, match="std_m and noise say the same"):
+    with pytest.raises(ValueError, match="std_m and noise must not both"):
         links.add(stream, time, 0, 0, 1.0, noise=NOISE, std_m=0.1)
-    with pytest.raises(ValueError, match="anchors must be all 5"):
+    with pytest.raises(ValueError, match="anchors must hold all 5"):
         links.add(stream, time, 0, 0, 1.0, anchors=np.zeros((4, 3)))

@@ -354,9 +354,7 @@ def test_what_cannot_be_is_refused():
     ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
     biased = iekf_bias(tags, NOISE, PROCESS)
     state = biased.update(biased.initial(rotation, translation, np.eye(6) * 0.01), ranges, anchors)
-    with pytest.raises(
-        ValueError, match="anchors must be the 5 whose biases the state holds, got 4"
-    ):
+    with pytest.raises(ValueError, match=r"the number of anchors must be 5, .*, got 4"):
         biased.update(state, ranges[:4], anchors[:4])
     with pytest.raises(ValueError, match="twist must be given"):
         biased.predict(state, None, 0.1)

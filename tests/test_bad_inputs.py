@@ -37,7 +37,7 @@ def spoiled(array, index, value):
     ("changes", "message"),
     [
         ({"rotation": np.eye(2)}, r"rotation must have shape \(..., 3, 3\), got \(2, 2\)"),
-        ({"rotation": 2 * np.eye(3)}, r"rotation must be orthogonal, Q Q\^T is off .* by 3"),
+        ({"rotation": 2 * np.eye(3)}, r"rotation must be orthogonal, but Q Q\^T differs .* by 3"),
         ({"rotation": -np.eye(3)}, "rotation must be a proper rotation, got a reflection"),
         ({"translation": [0, 0]}, r"translation must have shape \(..., 3\), got \(2,\)"),
         ({"translation": [0, np.nan, 0]}, r"translation must be finite, got nan at index \(1,\)"),
@@ -46,7 +46,7 @@ def spoiled(array, index, value):
         ({"covariance": np.zeros((6, 6))}, "covariance must be positive definite, .* eigenvalue 0"),
         (
             {"covariance": spoiled(np.eye(6), (0, 1), 0.5)},
-            "covariance must be symmetric, is off by",
+            "covariance must be symmetric, but its asymmetry is",
         ),
     ],
 )

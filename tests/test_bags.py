@@ -266,7 +266,7 @@ def test_fields_of_an_own_type_are_named(form, tmp_path, capsys):
         "the same link twice at one time": 1,
     }
     notes = " ".join(result["notes"])
-    assert "anchors.csv is yours to write: anchor,x,y,z in metres, world frame, of 1" in notes
+    assert "Write it with the columns anchor,x,y,z in metres, world frame, for 1" in notes
     assert "sorted" in notes
 
 
@@ -296,7 +296,7 @@ def test_lists_constants_and_times_of_their_own(tmp_path):
         ("13.250000000", "5", "a001020304ff", "6.5", "0.1"),
     ]
     table |= {"anchor": "a@index", "time": "@bag"}
-    with pytest.raises(ValueError, match="no field path"):
+    with pytest.raises(ValueError, match="not a field path"):
         recordings.convert_bag(log, tmp_path / "out", {"ranges": table})
     table |= {"anchor": "@index", "tag": "{nodes[].id}-{stamp_s}"}
     result = recordings.convert_bag(log, tmp_path / "out", {"ranges": table})
@@ -318,7 +318,7 @@ def test_milliseconds_are_told_by_their_unit(tmp_path):
         "tag": "=t",
         "range": "nodes[].distance",
     }
-    with pytest.raises(ValueError, match=r"span 4000 s, their recording 4 s: .*time_unit"):
+    with pytest.raises(ValueError, match=r"span 4000 s, but the recording lasts 4 s: .*time_unit"):
         recordings.convert_bag(log, tmp_path / "out", {"ranges": table})
     table["time_unit"] = "ms"
     result = recordings.convert_bag(log, tmp_path / "out", {"ranges": table})
@@ -348,12 +348,12 @@ def test_the_tags_of_the_body_tell_the_ends_of_a_link(tmp_path):
     types = types_of("ros1")
     log = write_bag(tmp_path / "miluv", "ros1", types, miluv(types))
     result = recordings.convert_bag(log, tmp_path / "all")
-    assert any("0, 11, 20 stand at both ends" in note for note in result["notes"])
+    assert any("0, 11, 20 are used both as anchors and as tags" in note for note in result["notes"])
     result = recordings.convert_bag(log, tmp_path / "body", {"ranges": {"tags": ["10", "11"]}})
     rows = [(row["anchor"], row["tag"]) for row in read_csv(tmp_path / "body" / "ranges.csv")]
     assert rows == [("0", "10"), ("1", "11"), ("0", "11"), ("20", "10")]
     assert result["kinds"]["ranges"]["dropped"] == {
-        "no tag of the body": 1,
+        "not a tag of the body": 1,
         "between two tags of the body": 1,
     }
 
@@ -406,7 +406,7 @@ def test_truth_from_a_tree_of_frames(tmp_path, capsys):
     out = tmp_path / "out"
     options = ["--out", str(out), "--ranges", "none", "--truth"]
     assert main(["convert", str(log), *options, "/tf"]) == 2
-    assert "/tf holds many frames: give parent and child" in capsys.readouterr().err
+    assert "/tf has messages of many frames: give parent and child" in capsys.readouterr().err
     assert main(["convert", str(log), *options, "/tf,parent=world,child=base"]) == 0
     rows = read_csv(out / "truth.csv")
     assert list(rows[0]) == ["t", "x", "y", "z", "qw", "qx", "qy", "qz"]
@@ -465,7 +465,7 @@ def test_anchors_that_move_and_places_that_nobody_knows(tmp_path):
     places = [(0, 0, 0), unknown, (0, 0, 0), unknown]
     log = write_bag(tmp_path / "a", "ros1", types, viral(types, places, offsets))
     result = recordings.convert_bag(log, tmp_path / "a")
-    assert "anchors: the messages know no place of 101" in result["notes"]
+    assert "anchors: the messages give no position of 101" in result["notes"]
     assert [row["anchor"] for row in read_csv(tmp_path / "a" / "anchors.csv")] == ["100"]
     places = [(0, 0, 0), (5, 0, 0), (1, 0, 0), (5, 0, 0)]
     log = write_bag(tmp_path / "b", "ros1", types, viral(types, places, offsets))
@@ -479,7 +479,7 @@ def test_anchors_that_move_and_places_that_nobody_knows(tmp_path):
     ]
     offsets[2] = (-0.1, 0, 0)
     log = write_bag(tmp_path / "c", "ros1", types, viral(types, places, offsets))
-    with pytest.raises(ValueError, match=r"tag '200\.0' stands at several places.* 0\.2 m apart"):
+    with pytest.raises(ValueError, match=r"tag '200\.0' has several positions.* 0\.2 m apart"):
         recordings.convert_bag(log, tmp_path / "c")
 
 
@@ -508,7 +508,7 @@ def test_clocks_that_differ_and_stamps_that_are_missing(tmp_path):
     log = write_bag(tmp_path / "own", "ros1", types, sorted(messages, key=lambda m: m[1]))
     result = recordings.convert_bag(log, tmp_path / "out", {"ranges": MINE})
     notes = " ".join(result["notes"])
-    assert "imu: the messages hold no stamps, times are those of recording" in notes
+    assert "imu: the messages have no stamps, so the times of recording are used" in notes
     assert "stamps are behind the recording by: ranges 3.000 s, imu 0.000 s" in notes
     assert read_csv(tmp_path / "out" / "imu.csv")[1]["t"] == "1700000000.000000001"
 
@@ -523,10 +523,10 @@ def test_one_of_several_topics_is_not_guessed(tmp_path):
     log = write_bag(tmp_path / "two", "ros1", types, messages)
     none = {"ranges": {"topic": "none"}}
     result = recordings.convert_bag(log, tmp_path / "out", none)
-    assert result["notes"] == ["no imu written, several topics could be it: /a/imu, /b/imu"]
+    assert result["notes"] == ["imu not written, as several topics are possible: /a/imu, /b/imu"]
     result = recordings.convert_bag(log, tmp_path / "out", {**none, "imu": {"topic": "/b/*"}})
     assert result["kinds"]["imu"]["topics"] == ["/b/imu"]
-    with pytest.raises(ValueError, match=r"imu\.csv is there and does not come from this log"):
+    with pytest.raises(ValueError, match=r"imu\.csv exists and does not come from this log"):
         recordings.convert_bag(log, tmp_path / "out", {**none, "imu": {"topic": "none"}})
 
 
@@ -545,7 +545,9 @@ def test_a_bag_without_definitions_takes_those_of_a_folder(tmp_path, capsys):
     given = ",".join(f"{key}={value}" for key, value in MINE.items())
     command = ["convert", str(database), "--out", str(tmp_path / "out"), "--ranges", given]
     assert main(command) == 2
-    assert "holds no definition of my_uwb/msg/Range, give the folder" in capsys.readouterr().err
+    assert (
+        "has no definition of the type my_uwb/msg/Range: give the folder" in capsys.readouterr().err
+    )
     definition = tmp_path / "src" / "my_uwb" / "msg" / "Range.msg"
     definition.parent.mkdir(parents=True)
     definition.write_text(DEFINITIONS["my_uwb/msg/Range"])
@@ -579,7 +581,7 @@ def test_topics_and_fields_are_listed(small, capsys):
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ({}, r"no topic is of a type of ranges that is known.*/uwb \(my_uwb/msg/Range\)"),
+        ({}, r"no topic has a known type of ranges.*/uwb \(my_uwb/msg/Range\)"),
         ({"ranges": {"topic": "/uwb"}}, "my_uwb/msg/Range: say where anchor, tag, range stands"),
         ({"ranges": {**MINE, "topic": "/x"}}, r"no topic '/x', there are /uwb"),
         (
@@ -588,10 +590,10 @@ def test_topics_and_fields_are_listed(small, capsys):
         ),
         ({"ranges": {**MINE, "tag": "header.frame"}}, "no field 'header.frame', there is"),
         ({"ranges": {**MINE, "range": "header"}}, "range must be a number, got std_msgs__msg__Hea"),
-        ({"ranges": {**MINE, "range": "a b"}}, "'a b' is no field path"),
-        ({"ranges": {**MINE, "anchor": "@node"}}, "'@node' must be of"),
-        ({"ranges": {**MINE, "unit": "ft"}}, "unit must be of .* got 'ft'"),
-        ({"ranges": {**MINE, "time_unit": "min"}}, "time_unit must be of .* got 'min'"),
+        ({"ranges": {**MINE, "range": "a b"}}, "'a b' is not a field path"),
+        ({"ranges": {**MINE, "anchor": "@node"}}, "'@node' must be one of"),
+        ({"ranges": {**MINE, "unit": "ft"}}, "unit must be one of .* got 'ft'"),
+        ({"ranges": {**MINE, "time_unit": "min"}}, "time_unit must be one of .* got 'min'"),
         ({"ranges": {**MINE, "time": "header.frame_id"}}, "time must be a stamp or a number"),
         ({"ranges": {**MINE, "anchors": "x"}}, r"\[ranges\] unknown key 'anchors'"),
         ({"range": MINE}, r"unknown table \[range\]"),
@@ -601,7 +603,7 @@ def test_topics_and_fields_are_listed(small, capsys):
         ),
         (
             {"ranges": MINE, "truth": {"topic": "/uwb", "position": "here", "child": "b"}},
-            "child: messages of type my_uwb/msg/Range name no such frame",
+            "child: messages of type my_uwb/msg/Range have no such frame",
         ),
     ],
 )
@@ -621,7 +623,7 @@ def test_a_file_that_is_no_bag_is_refused_by_name(name, tmp_path):
         recordings.list_topics(path)
     with pytest.raises(ValueError, match="no such file or folder"):
         recordings.list_topics(tmp_path / "absent.bag")
-    with pytest.raises(ValueError, match=r"holds metadata\.yaml"):
+    with pytest.raises(ValueError, match=r"must have a file metadata\.yaml"):
         recordings.list_topics(tmp_path)
 
 
@@ -644,7 +646,7 @@ def test_options_as_a_table(capsys, small, tmp_path):
         main(["convert", str(small), "--ranges", "tag=a,tag=b"])
     assert "each key once" in capsys.readouterr().err
     assert main(["convert", str(small)]) == 2
-    assert "--out DIR is missing" in capsys.readouterr().err
+    assert "--out DIR must be given" in capsys.readouterr().err
     bad = tmp_path / "bad.toml"
     bad.write_text("[ranges")
     assert main(["convert", str(small), "--list", "--map", str(bad)]) == 2
@@ -662,7 +664,7 @@ def test_field_paths_into_lists():
         (2, 5, "/t", 9, 0, "x:5", "k"),
         (2, 6, "/t", 9, 1, "x:6", "k"),
     ]
-    with pytest.raises(ValueError, match=r"equally long, got \[2, 3\]"):
+    with pytest.raises(ValueError, match=r"the same length, got \[2, 3\]"):
         bag_fields.rows(received, [bag_fields.getter("a[]"), bag_fields.getter("b[].c")])
     with pytest.raises(KeyError, match="no item 'a\\[7\\]', there are 3"):
         bag_fields.getter("a[7]")(received)

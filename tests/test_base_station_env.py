@@ -120,7 +120,7 @@ def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared():
     [
         ({"scene": "uwb_room"}, "scene must be a dict"),
         ({"scene": {"n_anchors": 2, "anchors": None}}, "n_anchors = 1"),
-        ({"scene": {"links": {"drop_probability": 0.1}}}, "neither links"),
+        ({"scene": {"links": {"drop_probability": 0.1}}}, "no failing links"),
         ({"scene": {"walls": 2}}, "no field 'walls'"),
         ({"angle_std_rad": 0.0}, "angle_std_rad must be"),
         ({"reward": "belief"}, "reward must be one of"),
@@ -239,7 +239,10 @@ def test_filters_run_in_drawn_worlds(mode, observation):
         ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must not be given beside scenes"),
         ({"scenes": ["hall"]}, r"scenes\[0\] must be a dict of changes, got 'hall'"),
         ({"scenes": []}, "scenes must hold at least one scene"),
-        ({"scenes": [{}, {"tags": [[0, 0, 0]]}]}, r"bodies of one number of tags, got \[1, 4\]"),
+        (
+            {"scenes": [{}, {"tags": [[0, 0, 0]]}]},
+            r"the same number of tags, .*; got \[1, 4\] tags",
+        ),
         ({"scenes": {"n_anchors": 2, "anchors": None}}, "scene must have n_anchors = 1, got 2"),
     ],
 )

@@ -203,7 +203,7 @@ def test_singular_geometry_is_named_with_its_rank_in_any_unit(case, unit_m):
     if rank == 6:
         bounds.pose_crb(*w, law)
         return
-    with pytest.raises(ValueError, match=f"information of rank {rank} of 6"):
+    with pytest.raises(ValueError, match=f"information has rank {rank} of 6"):
         bounds.pose_crb(*w, law)
     prior = np.diag([1.0] * 3 + [unit_m**2] * 3)
     assert np.isfinite(bounds.pose_crb(*w, law, prior_information=prior)).all()
@@ -212,7 +212,7 @@ def test_singular_geometry_is_named_with_its_rank_in_any_unit(case, unit_m):
 def test_singular_trial_of_a_batch_is_named():
     anchors, tags, Q, t = world(7, (3, 2))
     anchors[1, 0] = anchors[1, 0, :1]
-    with pytest.raises(ValueError, match=r"of rank 3 of 6 at batch index \(1, 0\)"):
+    with pytest.raises(ValueError, match=r"has rank 3 of 6 at batch index \(1, 0\)"):
         bounds.pose_crb(anchors, tags, Q, t, LAWS[0])
 
 

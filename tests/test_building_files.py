@@ -286,7 +286,11 @@ def test_bodies_of_one_or_two_tags_where_the_question_allows():
         (two, {}, "tags must be at least 3"),
         (two, {"position_m": 0.1, "heading_deg": 5}, "tags must be at least 3"),
         (two, {"attitude": "level"}, "tags must be at least 3"),
-        (one, {"attitude": "heading", "heading_deg": 5}, "tags must not stand above each other"),
+        (
+            one,
+            {"attitude": "heading", "heading_deg": 5},
+            "tags must not all lie on one vertical line",
+        ),
     ):
         tables = HALL | {"body": {"tags": tags}}
         tables["zones"] = [{"low": [1, 1, 0], "high": [9, 7, 2], **zone}]
@@ -364,19 +368,23 @@ BAD = [
     ("forbidden.0.low_m", 2e6, "forbidden[0].low_m must be a finite number"),
     ("anchors.kind", "room", "anchors must have the key 'low'"),
     ("anchors.fixed", [[16, 5, 2]], "anchors.fixed[0] = (16, 5, 2) lies inside an obstacle"),
-    ("anchors.fixed", [[1, 1, 2]] * 9, "the number of anchors counts the fixed ones: at least 9"),
+    (
+        "anchors.fixed",
+        [[1, 1, 2]] * 9,
+        "the number of anchors includes the fixed ones: it must be at least 9",
+    ),
     ("anchors.fixed", [[1, 2]], "anchors.fixed must have shape"),
     ("anchors.half_angle_deg", 200, "anchors.half_angle_deg must be a finite number in [0.1"),
     ("anchors.range_edge_m", 50, "anchors.range_edge_m must be at most anchors.max_range_m = 30"),
-    ("anchors.max_range_m", None, "anchors.range_edge_m means nothing without anchors.max_ran"),
+    ("anchors.max_range_m", None, "anchors.range_edge_m needs anchors.max_ran"),
     ("zones.0.polygon", [[60, 60], [61, 60], [61, 61]], "zones[0] ('open plan') is 61.9 m from"),
     ("zones.0.polygon", [[15.5, 5], [17, 5], [17, 6]], "obstacles leave no free place in zones[0]"),
     ("zones.0.low_m", 2, "zones[0]: low_m must lie below high_m, got 2 and 1.2"),
     ("zones.0.position_m", 0, "zones[0].position_m must be a finite number"),
     ("zones.0.share", 1, "zones[0].share must be a finite number in [0.01, 0.9999]"),
-    ("zones.1.position_m", None, "zones[1].share means nothing without position_m, height_m"),
+    ("zones.1.position_m", None, "zones[1].share needs one of position_m, height_m"),
     ("zones.0.attitude", "up", "zones[0].attitude must be one of 'free', 'level', 'heading'"),
-    ("zones.1.name", "open plan", "zones[1].name must differ from the others"),
+    ("zones.1.name", "open plan", "zones[1].name must differ from the names of the others"),
     ("plan", {"images": "x"}, "plan has an unknown key 'images'"),
     ("plan", {"metres_per_pixel": 0}, "plan.metres_per_pixel must be a finite number"),
     ("plan", {"image": "a.png"}, "plan.metres_per_pixel must be given with plan.image"),
@@ -396,9 +404,9 @@ def test_what_is_wrong_is_named_with_its_table(path, value, message):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("mounts", [{"kind": "points", "points": [[16, 5, 2.5]]}], "mounts have no legal place"),
-        ("mounts", [{"kind": "points", "points": [[1, 1, 2.5]]}], "mounts list 1 legal points"),
-        ("forbidden.0.polygon", [[-9, -9], [99, -9], [99, 99], [-9, 99]], "mounts have no legal"),
+        ("mounts", [{"kind": "points", "points": [[16, 5, 2.5]]}], "mounts have no permitted pl"),
+        ("mounts", [{"kind": "points", "points": [[1, 1, 2.5]]}], "mounts have 1 permitted points"),
+        ("forbidden.0.polygon", [[-9, -9], [99, -9], [99, 99], [-9, 99]], "mounts have no permi"),
         ("mounts.0", {"kind": "points", "points": [[1, 1, 1]], "axis": [0, 0, 0]},
          "mounts[0].axis must not be zero"),
     ],
@@ -412,7 +420,7 @@ def test_a_zone_of_another_place_is_refused():
     tables = changed("zones.0", {"low": [500, 1, 0], "high": [505, 7, 2]}, HALL)
     with pytest.raises(ValueError, match=r"^zones\[0\] \('zone 1'\) is 490 m from the nearest"):
         scene_files.of_mapping(tables)
-    with pytest.raises(ValueError, match=r"^forbidden means nothing with anchors\.kind = 'box'"):
+    with pytest.raises(ValueError, match=r"^forbidden has no effect with anchors\.kind = 'box'"):
         scene_files.of_mapping(HALL | {"forbidden": [{"polygon": SQUARE}]})
 
 

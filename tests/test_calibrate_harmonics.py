@@ -109,7 +109,7 @@ def test_tags_found_by_themselves_are_no_better_known_than_the_patterns_allow():
         if law is None:
             assert std.max() < 0.012
         else:
-            assert "a shift of it" in " ".join(found.figures["not_determined"])
+            assert "a shift of the tag" in " ".join(found.figures["not_determined"])
 
 
 @with_kernels
@@ -148,7 +148,7 @@ def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     assert errors[1] < 0.7 * errors[0]
     wrong = ["--filter", "iekf", "--directions", str(out / "directions.csv")]
     assert main(["replay", *logs, "--planar", *wrong]) == 2
-    assert "directions are read by iekf-log" in capsys.readouterr().err
+    assert "only the filters iekf-log" in capsys.readouterr().err
     assert main(["calibrate", *logs[:8], *wrong[2:]]) == 2
     assert "without --directions" in capsys.readouterr().err
 

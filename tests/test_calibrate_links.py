@@ -244,7 +244,7 @@ def test_spread_of_residuals_leaves_biases_out():
     [
         ({"truth": None}, "calibrated by truth"),
         ({"rotation": None}, "must have rotations"),
-        ({"planar": True}, "say planar"),
+        ({"planar": True}, "set planar"),
         ({"late": 100.0}, "no range has truth"),
     ],
 )
@@ -291,7 +291,7 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
     assert main(["calibrate", *arguments, "--calibration", str(out / "calibration.csv")]) == 2
     assert "without --calibration" in capsys.readouterr().err
     assert main(["calibrate", *arguments, "--start", "ranges"]) == 2
-    assert "--start means nothing with --truth" in capsys.readouterr().err
+    assert "--start must be left out with --truth" in capsys.readouterr().err
 
 
 @pytest.mark.long

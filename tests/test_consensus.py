@@ -256,12 +256,12 @@ def test_an_edge_that_comes_twice_was_measured_twice():
     ("change", "message"),
     [
         ({"y": [0.1, np.nan, 0.2]}, "y must be finite, got nan at index"),
-        ({"y": [0.1, 0.2]}, r"y must have shape \(3,\) like the edges"),
+        ({"y": [0.1, 0.2]}, r"y must have shape \(3,\), a row for each edge"),
         ({"n_nodes": 4}, "2 components"),
         ({"cycles": "some"}, "cycles must be one of"),
-        ({"cycles": np.ones((1, 2))}, "a column per edge"),
+        ({"cycles": np.ones((1, 2))}, "one for each edge"),
         ({"cycles": 2 * np.array([[1, 1, -1]])}, "cycles must have entries -1, 0 and 1, got 2"),
-        ({"cycles": [[1, 1, 1]]}, "closed walks, got one that is not in row 0"),
+        ({"cycles": [[1, 1, 1]]}, "closed walks, but row 0 is an open one"),
         ({"exchange": CycleExchange("random")}, "order must be one of"),
         (
             {"exchange": CycleExchange("asynchronous")},

@@ -90,8 +90,8 @@ WORDS = {
     "an anchor's ranges": "the ranges of anchor A3 look 0.5",
     "a tag's ranges": "the ranges of tag T2 look 0.4",
     "a link": "the ranges from anchor A3 to tag T1 look 0.8",
-    "an anchor": "anchor A2 looks to be off",
-    "deviation": "--range-std-m 0.1 or so",
+    "an anchor": "anchor A2 looks misplaced",
+    "deviation": "try --range-std-m 0.1",
     "walk": "--walk-m 0.3 --walk-deg 20 or so",
 }
 
@@ -114,7 +114,7 @@ def test_the_fault_put_in_is_named(fault):
     assert WORDS.get(fault, "") in cause["text"]
     # Ranges far too long for the room may fit a mirror pose as well.
     whole = found["nis_per_dof"] > 1.5 or found["refused_share"] > 0.2
-    subject = "the filter contradicts its data" if whole else "a part of the ranges contradicts"
+    subject = "the filter does not fit its data" if whole else "a part of the ranges does not fit"
     assert notes[-1].startswith(f"WARNING: {subject}")
     assert cause["text"] in notes[-1]
 

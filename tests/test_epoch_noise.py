@@ -140,7 +140,7 @@ def test_a_noise_that_is_no_law_is_refused(name):
     ranges = ranging.distances(anchors, TAGS)
     with pytest.raises(ValueError, match=r"noise must have variance and .* got 0.1"):
         filter.update(state, ranges, anchors, noise=0.1)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match=r"noise does not fit ranges of shape \(4, 6\)"):
+    with pytest.raises(ValueError, match=r"noise must fit ranges of shape \(4, 6\)"):
         filter.update(state, ranges, anchors, noise=ranging.LinkNoise(np.ones((3, 6))))
 
 

@@ -395,7 +395,7 @@ def test_errors_are_one_line(tmp_path, capsys):
             ["evaluate", "selection", "--policy", str(good), "--policy", str(same)],
             "two files are named 'mine'",
         ),
-        (["evaluate", "selection", "--policy", str(broken)], "is no policy of rbl-gym"),
+        (["evaluate", "selection", "--policy", str(broken)], "is not a policy of rbl-gym"),
         (["evaluate", "selection", "--policy", str(tmp_path / "no.npz")], "No such file"),
         (["transfer", "mounts", "--policy", str(good)], "policy 'mine' does not fit"),
         (["train", "selection", "--seed", "1000"], "seed must be below 1000"),

@@ -486,7 +486,7 @@ def test_the_selection_shows_the_drawn_hall_and_what_was_learned():
 @pytest.mark.parametrize(
     ("name", "arguments", "named"),
     [
-        ("MobileAnchors", {"scenes": [STILL]}, "scene must have anchors that move"),
+        ("MobileAnchors", {"scenes": [STILL]}, "scene must have moving anchors"),
         ("MobileAnchors", {"scenes": CRAFT, "scene": "hall"}, "scene must not be given beside"),
         ("AnchorSelection", {"scenes": HALLS, "k": 8}, "k must be .* 7, got 8"),
     ],

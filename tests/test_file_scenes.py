@@ -203,7 +203,7 @@ def test_a_layout_gives_the_anchors(tmp_path):
     observation, _ = env.reset(seed=1)
     np.testing.assert_array_equal(observation["anchors"], [[-20, -10, 4], [20, 10, 4], [0, 10, 5]])
     assert scenes.get({"name": "hall", "layout": str(layout)}).n_anchors == 3
-    with pytest.raises(ValueError, match="either anchors or a layout, got both"):
+    with pytest.raises(ValueError, match="either anchors or layout, got both"):
         scenes.get({**scene, "anchors": [[0, 0, 0]]})
     layout.write_text("x_m,y_m,z_m\n1,2,3\n1,two,3\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"layout.csv, line 3, column y_m: must be a number"):
@@ -219,7 +219,9 @@ def test_files_are_members_of_families():
 
 
 def test_walls_of_different_files_do_not_mix(floor):
-    with pytest.raises(ValueError, match="must all be of one file, got 'uwb_room' beside 'floor'"):
+    with pytest.raises(
+        ValueError, match="must all come from one file, got 'uwb_room' beside 'floor'"
+    ):
         gym.make("rbl_gym:RBL/Tracking-v0", scenes=[floor, "uwb_room"])
     with pytest.raises(ValueError, match="scenes must have no walls"):
         gym.make("rbl_gym:RBL/AnchorPlacement-v0", scenes=[floor])
@@ -281,7 +283,7 @@ def test_what_is_no_file_is_named():
         scenes.get("nowhere.toml")
     with pytest.raises(ValueError, match="scene must be one of 'uwb_room'"):
         scenes.get("nowhere.txt")
-    with pytest.raises(ValueError, match="fixed must be places of at most n_anchors = 1"):
+    with pytest.raises(ValueError, match="fixed must hold positions of at most n_anchors = 1"):
         scenes.get({"name": "hall", "n_anchors": 1, "fixed": [[0, 0, 1], [1, 1, 1]]})
 
 

@@ -60,7 +60,7 @@ def test_a_sensor_by_name_and_by_fields():
     ("value", "message"),
     [
         ("cheap", "inertial.kind must be one of 'consumer', 'tactical', got 'cheap'"),
-        ({"noise": 1.0}, "inertial has no field 'noise'; it has rate_hz"),
+        ({"noise": 1.0}, "inertial has no field 'noise'; its fields are rate_hz"),
         ({"gyro_noise": -1.0}, "gyro_noise must be a finite number"),
         (3, "inertial must be a name or a dict of its fields, got 3"),
     ],
@@ -151,7 +151,7 @@ def test_splines_go_through_poses():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: smooth.bspline(np.eye(3)[None], np.zeros((1, 3)), 1.0, [0.0]), "2 poses or more"),
+        (lambda: smooth.bspline(np.eye(3)[None], np.zeros((1, 3)), 1.0, [0.0]), "at least 2"),
         (
             lambda: smooth.bspline(np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)), 1.0, [2.5]),
             r"times must be \(T,\) from 0 to 2",
@@ -262,7 +262,7 @@ def test_samples_of_no_length_tell_nothing():
         (np.zeros((3, 5)), 0.1, r"readings must have shape \(..., S, 6\), got \(3, 5\)"),
         (np.full((3, 6), np.nan), 0.1, "readings must be finite"),
         (np.zeros((3, 6)), -0.1, "steps must not be negative, got -0.1"),
-        (np.zeros((3, 6)), [0.1, 0.1], "steps must be one, or one for each of 3 samples"),
+        (np.zeros((3, 6)), [0.1, 0.1], "steps must be one number, or one for each of 3 samples"),
     ],
 )
 def test_what_cannot_be_preintegrated(readings, steps, message):
@@ -380,7 +380,7 @@ def test_a_log_is_read_in_its_units(tmp_path):
         (ROWS, {"force_unit": "g"}, r"9.81 g, of a log in g \(looks like m/s\^2\?"),
         ([(t, *w, *np.array(a) / G) for t, *w, a in [(r[0], *r[1:4], r[4:]) for r in ROWS]], {},
          "looks like g, or gravity"),
-        ([(r[0], 200, 0, 0, *r[4:]) for r in ROWS], {}, r"looks like deg/s\?"),
+        ([(r[0], 200, 0, 0, *r[4:]) for r in ROWS], {}, r"if it is in deg/s"),
     ],
 )  # fmt: skip
 def test_what_is_no_log(tmp_path, rows, options, message):
@@ -399,5 +399,5 @@ def test_samples_between_two_times():
         assert len(readings) == len(steps)
     gappy = InertialLog(np.array([0, 0.01, 0.3, 0.31]), np.zeros((4, 6)))
     for start, end in ((0.1, 0.2), (0.0, 0.31), (0.005, 0.02), (0.4, 0.5)):
-        with pytest.raises(ValueError, match=r"more than max_gap_s = 0\.1"):
+        with pytest.raises(ValueError, match=r"longer than max_gap_s = 0\.1"):
             samples_between(gappy, start, end)

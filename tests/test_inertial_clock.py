@@ -160,4 +160,4 @@ def test_axes_and_clock_of_an_imu_on_the_command_line(tmp_path, capsys):
     assert main(["calibrate", *told, "--imu-frame=1,2,3"]) == 2
     assert "leave out --imu-frame" in capsys.readouterr().err
     assert main(["calibrate", *[x for x in told if "truth" not in x]]) == 2
-    assert "--imu means nothing without --truth" in capsys.readouterr().err
+    assert "--imu needs --truth" in capsys.readouterr().err

@@ -202,7 +202,7 @@ def test_a_scene_without_a_sensor_has_nothing_for_the_filter():
     trials = monte_carlo.simulate_trials(scenes.get("uwb_room"), 2, np.random.default_rng(0))
     with pytest.raises(ValueError, match="reads an inertial sensor"):
         monte_carlo.track_trials(trials, "iekf-imu", {})
-    with pytest.raises(ValueError, match="filter must be one that is told the twist"):
+    with pytest.raises(ValueError, match="filter must be one that takes the twist"):
         gym.make("rbl_gym:RBL/AnchorPlacement-v0", reward="filter", filter="iekf-imu",
                  scene={"name": "uwb_room", "inertial": "consumer"})  # fmt: skip
     readings = monte_carlo.told_readings(trials.scene, trials.episode, trials.measurements)

@@ -122,8 +122,10 @@ def test_a_wrong_window_is_left_out_and_counted():
     assert figures["epochs_excluded"] == 16
     assert figures["epochs_with_truth"] == 184
     assert figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
-    assert "16 more are left out" in compared(figures)[1]
-    with pytest.raises(ValueError, match="truth_exclude leaves no epoch with truth: 200 of 200"):
+    assert "16 epochs more are excluded" in compared(figures)[1]
+    with pytest.raises(
+        ValueError, match="truth_exclude must leave an epoch with truth, but excludes all 200"
+    ):
         replayed(truth, truth_exclude=[(-5, 100)])
 
 
@@ -184,7 +186,7 @@ def test_what_cannot_be_compared_is_said():
         replayed(still, time_offset="auto")
     with pytest.raises(ValueError, match="align 'se3': the positions do not determine a rotation"):
         replayed(still, align="se3")
-    with pytest.raises(ValueError, match="align 'se3': a plane has no heights"):
+    with pytest.raises(ValueError, match="align 'se3': planar motion has no heights"):
         replayed(Truth(TIMES, ROTATION, PLACE), align="se3", planar=True, height_offset_m=0.0)
     for options, message in (
         ({"align": "sim3"}, "align must be one of"),

@@ -38,8 +38,8 @@ def test_anchors_without_names_are_counted(tmp_path):
     [
         ("", "first line must name the columns"),
         ("x,y,z\n1,2,3\n", "x_m, y_m, z_m not found in 'x,y,z'"),
-        ("x_m,y_m,z_m\n", "no anchor in it"),
-        ("x_m,y_m,z_m\n1,2,3\n1,2\n", "line 3: 3 cells needed, got 2"),
+        ("x_m,y_m,z_m\n", "must have at least one anchor"),
+        ("x_m,y_m,z_m\n1,2,3\n1,2\n", "line 3: must have 3 cells like the header, got 2"),
         ("x_m,y_m,z_m\n1,2,high\n", "line 2, column z_m: must be a number, got 'high'"),
         ("x_m,y_m,z_m\n1,nan,3\n", "line 2, column y_m: must be a number, got 'nan'"),
         ("name,x_m,y_m,z_m\na,1,2,3\na,1,2,4\n", "line 3, column name: every anchor"),

@@ -334,7 +334,7 @@ def test_event_triggered_filters_say_how_often(tmp_path, short):
         (["--filters", "nowhere.at_all:make"], "cannot be imported: No module named 'nowhere'"),
         (["--filters", "tests.fragile:missing"], "cannot be imported: module 'tests.fragile'"),
         (["--filters", "tests.fragile:not_callable"], "must be callable, got 3"),
-        (["--filters", "iekf/robust"], "must be name/option=value"),
+        (["--filters", "iekf/robust"], "must have the form name/option=value"),
         (["--filters", "iekf/gain=2"], "filter 'iekf' has no option 'gain'"),
         (["--scenes", "moon"], "scene must be one of"),
         (["--scenes", "nowhere.toml"], "rbl-gym bench: nowhere.toml: No such file or directory"),
@@ -387,14 +387,14 @@ def test_a_file_takes_one_run_unless_it_is_replaced(tmp_path, short, capsys):
     status, kept = bench(tmp_path, *options, "--seed", 1)
     assert (status, kept) == (2, first)
     said = capsys.readouterr().err
-    assert "has records of seed 0, this run is of 1" in said
-    assert "use --out F, or --fresh, which drops the old records" in said
+    assert "has records with seed 0, but this run has 1" in said
+    assert "with --out F, or drop the old records with --fresh" in said
     status, other = bench(tmp_path, *options, "--seed", 1, "--fresh")
     assert status == 0
     assert rows(other)[0]["tags_m"] != rows(first)[0]["tags_m"]
     (tmp_path / "x.jsonl").write_text("not a record\n{}\n")
     assert bench(tmp_path, *options)[0] == 2
-    assert "line 1: no record of rbl-gym bench" in capsys.readouterr().err
+    assert "line 1: not a record of rbl-gym bench" in capsys.readouterr().err
 
 
 def test_records_say_what_they_are_of_and_times_stand_apart(tmp_path, short, capsys):
@@ -449,7 +449,7 @@ def test_rerun_gives_the_same_and_says_what_differs(tmp_path, short, capsys):
 def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
     (tmp_path / "empty.jsonl").write_text("")
     assert main(["rerun", str(tmp_path / "empty.jsonl")]) == 2
-    assert "holds no record" in capsys.readouterr().err
+    assert "must have a record" in capsys.readouterr().err
 
 
 def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys, monkeypatch):
@@ -568,8 +568,11 @@ def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, cap
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('name = "uwb_room"\nranges = "x.csv"', "must have the name of a scene, or the files of"),
-        ("steps = 3", "must have the name of a scene, or the files of"),
+        (
+            'name = "uwb_room"\nranges = "x.csv"',
+            "must have the key 'name' of a scene, or the files of",
+        ),
+        ("steps = 3", "must have the key 'name' of a scene, or the files of"),
         ('ranges = "ranges.csv"\nspeed = 3', "walk.toml: a recording has no 'speed'"),
         ('ranges = "ranges.csv"\nanchors = "a.csv"', "walk.toml: a recording needs 'tags'"),
         ("ranges = 3", "walk.toml: ranges must be the name of a file, got 3"),

@@ -80,7 +80,7 @@ def test_a_loop_closure_of_little_weight_bends_nothing(tmp_path, capsys):
     assert result["cost"] == pytest.approx(1e-4 * np.radians(off) ** 2, rel=1e-5)
     assert result["weights"] == "information of theta"
     unit = solved(path, capsys, "--weights", "unit")
-    assert unit["weights"] == "all edges alike, as asked for"
+    assert unit["weights"] == "equal for all edges, as asked for"
     for edge in unit["worst_edges"]:
         assert abs(edge["residual_deg"]) == pytest.approx(abs(off) / 5)
 
@@ -116,7 +116,7 @@ def test_edges_without_information_where_none_is_needed(tmp_path, capsys):
     path.write_text("\n".join(line.rsplit(maxsplit=6)[0] for line in loop))
     result = solved(path, capsys)
     assert result["cost"] == pytest.approx(0.3**2 / 3)
-    assert result["weights"] == "all edges alike: the file has no information"
+    assert result["weights"] == "equal for all edges, as the file has no information"
 
 
 def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
@@ -126,7 +126,7 @@ def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
     assert result["edges_without_weight"] == 1
     assert result["worst_edges"][0]["residual_deg"] == pytest.approx(np.degrees(1.1))
     assert main(["network", str(path)]) == 0
-    assert "1 edges left out, without information of theta" in capsys.readouterr().out
+    assert "1 edges without information of theta are left out" in capsys.readouterr().out
     # So little beside the others that rounding would drown it.
     path.write_text("EDGE_SE2 5 6 1 0 0.1 1 0 0 1 0 9\nEDGE_SE2 6 5 1 0 1 1 0 0 1 0 1e-15\n")
     assert solved(path, capsys)["edges_without_weight"] == 1

@@ -337,7 +337,7 @@ def test_everything_broadcasts():
         (lambda w: bounds.pose_crb(*w, NOISE, anchor_std_m=[0.1, 0.2]),
          r"anchor_std_m must be one number, or have shape \(5,\) or \(5, 3\), got \(2,\)"),
         (lambda w: bounds.pose_crb(*w, NOISE, anchor_std_m=0.1, tag_std_m=0.1),
-         "anchor_std_m goes with model 'raw' and tag_std_m 0"),
+         "anchor_std_m needs model 'raw' and tag_std_m = 0"),
         (lambda w: bounds.marginal_information(np.eye(5)), r"joint must have shape \(..., 6"),
         (lambda w: bounds.marginal_information(np.diag([1.0] * 7 + [0])), "joint must be"),
         (lambda w: bounds.epoch_information(bounds.RangeEpoch(*w[:3], w[3] * np.nan, NOISE)),

@@ -296,7 +296,7 @@ def test_filters_are_named_by_dicts_too():
     ("arguments", "named"),
     [
         ({"filter": {"iterations": 2}}, "filter must be a name, or a dict with a name"),
-        ({"filter": {"name": "iekf"}, "options": {}}, "options must be in the dict of the filter"),
+        ({"filter": {"name": "iekf"}, "options": {}}, "options must be None if filter is a dict"),
         ({"filter": {"name": "gold"}}, "filter must be one of"),
         ({"filter": {"name": "iekf", "wings": 2}}, "wings"),
     ],

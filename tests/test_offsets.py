@@ -98,7 +98,7 @@ def test_an_unknown_offset_costs_an_anchor():
 def test_offsets_that_are_none_are_refused():
     with pytest.raises(ValueError, match="offset must be one of 'tag'"):
         bounds.pose_crb(*world(), NOISE, offset="tags")
-    with pytest.raises(ValueError, match="offset goes with model 'raw'"):
+    with pytest.raises(ValueError, match="offset needs model 'raw'"):
         bounds.pose_crb(*world(), NOISE, offset="tag", model="squared")
 
 
@@ -259,8 +259,8 @@ def test_rank_says_what_differences_leave():
     ("change", "message"),
     [
         ({"offset": "tags"}, "offset must be one of"),
-        ({"offset": "tag", "tag_std_m": 0.1}, "offset goes with tag_std_m 0"),
-        ({"offset": "anchor", "method": "cls"}, "offset 'anchor' goes with"),
+        ({"offset": "tag", "tag_std_m": 0.1}, "offset needs tag_std_m = 0"),
+        ({"offset": "anchor", "method": "cls"}, "offset 'anchor' needs"),
         ({"offset": "tag", "ranges": np.full((M, N), np.nan)}, "ranges must be finite"),
         ({"offset": "tag", "ranges": np.ones((M, N + 1))}, "ranges must"),
         ({"offset": "tag", "links": np.ones((M, N + 1))}, "links must have shape"),

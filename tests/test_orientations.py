@@ -138,7 +138,7 @@ def test_wrong_weights_are_named():
         orientations(edges, y, 3, weights=[1, 0])
     with pytest.raises(ValueError, match="at least 1e-12 of the largest, 2, got 1e-13 at index 1"):
         orientations(edges, y, 3, weights=[2, 1e-13])
-    with pytest.raises(ValueError, match=r"weights must have shape \(2,\) like the edges"):
+    with pytest.raises(ValueError, match=r"weights must have shape \(2,\), a row for each edge"):
         chordal_optimum(edges, y, 3, weights=[1.0])
     with pytest.raises(ValueError, match="weights must be None with the method 'cycle'"):
         orientations(edges, y, 3, method="cycle", weights=[1, 1])
@@ -319,6 +319,8 @@ def test_wrong_networks_are_named(method, edges, y, message):
 def test_unknown_methods_and_options_are_named():
     with pytest.raises(ValueError, match="method must be one of 'ml'"):
         orientations([[0, 1]], [0.1], 2, method="best")
-    with pytest.raises(ValueError, match=r"options are of the method 'cycle' only, got \['tol'\]"):
+    with pytest.raises(
+        ValueError, match=r"options are allowed only with the method 'cycle', got \['tol'\]"
+    ):
         orientations([[0, 1]], [0.1], 2, tol=1)
     assert estimators.orientations([[0, 1]], [0.1], 2, method="cycle", cycles="minimum")[1] == 0.1

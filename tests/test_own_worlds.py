@@ -119,9 +119,9 @@ def test_what_does_not_fit_is_named(change, message):
 def test_the_other_filters_and_scenes_refuse_a_process_of_each_trial(name):
     world = worlds()
     process = motion.ProcessNoise(world["rotation_rad"], 0.1)
-    with pytest.raises(ValueError, match="process must be that of all trials"):
+    with pytest.raises(ValueError, match="process must be the same for all trials"):
         estimators.make(name, tags=world["tags"][0], noise=RangeNoise(0.1), process=process)
-    with pytest.raises(ValueError, match="process must be that of all worlds"):
+    with pytest.raises(ValueError, match="process must be the same for all worlds"):
         dataclasses.replace(scenes.get("hall"), process=process)
     filter: Any = estimators.make(
         name, tags=world["tags"][0], noise=RangeNoise(0.1), process=motion.ProcessNoise(0.1, 0.1)

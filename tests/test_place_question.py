@@ -427,9 +427,9 @@ def test_the_verdict_says_what_to_do_next():
     [
         (["--keep", "a"], "--keep needs --layout"),
         (["--optimise"], "--optimise needs --layout"),
-        (["--layout", "LAYOUT", "--fewest"], "--fewest looks for a layout"),
+        (["--layout", "LAYOUT", "--fewest"], "--fewest searches for a layout"),
         (["--layout", "LAYOUT", "--keep", "a"], "--keep needs --optimise"),
-        (["--layout", "LAYOUT", "--anchors", "7"], "--anchors means nothing"),
+        (["--layout", "LAYOUT", "--anchors", "7"], "--anchors with --layout needs --optimise"),
         (["--layout", "LAYOUT", "--optimise", "--keep", "z"], "--keep must name anchors"),
         (["--layout", "LAYOUT", "--optimise", "--anchors", "5"], "must be at least 6"),
         (["--anchors", "11"], "too few for 11 anchors"),

@@ -134,13 +134,13 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
         (["plan", "x.png"], "x.png: a picture needs --metres-per-pixel or --width"),
         (["plan", "nowhere.geojson"], "nowhere.geojson: No such file or directory"),
         (["plan", "x.dwg"], "x.dwg: DWG files cannot be read: save the drawing as DXF"),
-        (["plan", "x.png", "--walls", "A"], "a picture has no layers: --walls means nothing"),
+        (["plan", "x.png", "--walls", "A"], "a picture has no layers: leave out --walls"),
         (["plan", "x.geojson", "--walls", "A,x=1"], "'x=1' must be KEY=VALUE"),
         (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),
-        (["place", "--scene", "uwb_room", "--walls", "A"], "--walls is of a drawing"),
+        (["place", "--scene", "uwb_room", "--walls", "A"], "--walls needs a drawing"),
         (["place", "--scene", "uwb_room", "--report", "x.doc"], "--report must end in .pdf"),
         (["place", "--scene", "uwb_room", "--export", "x.xls"], "--export must end in .csv"),
-        (["place", "--scene", "bad.geojson"], "bad.geojson: this is no GeoJSON"),
+        (["place", "--scene", "bad.geojson"], "bad.geojson: not a GeoJSON file"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_with_status_2(
@@ -166,7 +166,7 @@ def test_the_answer_is_in_words_and_signs(placed):
     assert zones[0].asks == "horizontal position 5 m in 95 % of the zone"
     assert zones[0].reached.startswith("100 % within (")
     assert zones[2].asks == zones[2].reached == ""
-    assert place_answer.headline(placed.result) == "5 anchors: 1 of 2 zones get what they ask for"
+    assert place_answer.headline(placed.result) == "5 anchors: 1 of 2 zones meet their requirements"
     assert place_answer.verdict(placed.result) == "fail"
     assert len(place_answer.question(placed.result)) == 3
 

@@ -81,8 +81,8 @@ def test_a_unit_is_asked_for_and_a_told_one_goes_before(tmp_path):
         read(path)
     assert read(path, units="mm").bounds()[1].tolist() == pytest.approx([12, 8])
     wide = read(write_dxf(tmp_path / "y.dxf", 4), units="m")
-    assert any("the drawing itself says mm" in line for line in wide.said)
-    assert any("odd size" in line for line in wide.said)
+    assert any("the drawing itself states mm" in line for line in wide.said)
+    assert any("unusual size" in line for line in wide.said)
 
 
 @needs("ezdxf")
@@ -119,7 +119,7 @@ def test_hatches_keep_their_holes_and_far_plans_come_near(tmp_path):
 def test_what_is_no_drawing_is_named(tmp_path):
     bad = tmp_path / "bad.dxf"
     bad.write_text("no group codes here\n")
-    with pytest.raises(ValueError, match=r"bad\.dxf: this is no DXF"):
+    with pytest.raises(ValueError, match=r"bad\.dxf: not a DXF file"):
         read(str(bad))
     with pytest.raises(ValueError, match="DWG files cannot be read: save the drawing as DXF"):
         read("x.dwg")
@@ -184,7 +184,7 @@ def test_the_tangent_plane_agrees_with_the_ellipsoid():
     ("text", "message"),
     [
         ("{", "Expecting"),
-        ("[1]", "this is no GeoJSON"),
+        ("[1]", "not a GeoJSON file"),
         ('{"type": "FeatureCollection", "features": 3}', "'features' must be a list"),
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]}', "feature 0: a Polygon needs 4"),
         ('{"type": "LineString", "coordinates": [[0, "a"], [1, 1]]}', "lists of \\[x, y\\]"),
@@ -253,7 +253,7 @@ def test_open_lines_on_a_layer_of_areas_are_counted():
     line = drawing.Shape("Z", "LINE", np.array([[0.0, 0.0], [3.0, 0.0]]))
     made = layers.building(plan_of(square(0, 0, 2, "Z"), line), uses("zones Z"))
     assert len(made.tables["zones"]) == 1
-    assert "layer Z, taken for zones: 1 lines that close no area were left out" in made.said
+    assert "layer Z, read as zones: 1 lines that enclose no area were left out" in made.said
 
 
 def test_mounts_on_a_ring_look_inwards_those_on_a_line_both_ways():
@@ -362,7 +362,7 @@ def test_a_picture_gives_its_rectangle(tmp_path):
     assert made.tables["mounts"][0]["height_m"] == 2.8
     bad = tmp_path / "bad.png"
     bad.write_text("no picture")
-    with pytest.raises(ValueError, match=r"bad\.png: this is no picture"):
+    with pytest.raises(ValueError, match=r"bad\.png: not a picture"):
         pictures.backdrop(str(bad), 0.05)
     with pytest.raises(ValueError, match="metres_per_pixel must be positive"):
         pictures.backdrop(plan["image"], 0.0)

@@ -122,12 +122,12 @@ def scaled(**changes):
     ("changes", "message"),
     [
         ({"meta": None}, "meta"),
-        ({"meta": np.array("no json")}, "is no policy of rbl-gym"),
-        ({"meta": np.array("[1]")}, "is no policy of rbl-gym"),
+        ({"meta": np.array("no json")}, "is not a policy of rbl-gym"),
+        ({"meta": np.array("[1]")}, "is not a policy of rbl-gym"),
         ({"meta": np.array("{}")}, "kind"),
         ({"meta": np.array('{"kind": "fuzzy"}')}, "kind must be one of 'box'"),
-        ({"weight_0": None, "bias_0": None}, "is no policy of rbl-gym"),
-        ({f"{n}_{k}": None for n in ("weight", "bias") for k in (0, 1)}, "it has no layers"),
+        ({"weight_0": None, "bias_0": None}, "is not a policy of rbl-gym"),
+        ({f"{n}_{k}": None for n in ("weight", "bias") for k in (0, 1)}, "the file has no layers"),
         ({"bias_1": None}, "bias_1"),
         ({"bias_1": np.zeros(4)}, "weight_1 must have shape"),
         ({"weight_1": np.zeros((3, 9))}, "weight_1 must have shape"),
@@ -135,11 +135,11 @@ def scaled(**changes):
         ({"weight_0": np.full((8, 5), np.nan)}, "weight_0 must be finite"),
         ({"bias_0": np.full(8, np.inf)}, "bias_0 must be finite"),
         ({"meta": np.array('{"kind": "box", "activation": "elu"}')}, "activation must be one of"),
-        ({"scaling_clip": np.array(1.0)}, "is no policy of rbl-gym"),
+        ({"scaling_clip": np.array(1.0)}, "is not a policy of rbl-gym"),
         (scaled(scale=np.zeros(5)), "must be positive"),
         (scaled(clip=np.array(-1.0)), "must be positive"),
         (scaled(mean=np.zeros(4)), "scaling_mean must have shape"),
-        ({"weight_0": np.array("text")}, "is no policy of rbl-gym"),
+        ({"weight_0": np.array("text")}, "is not a policy of rbl-gym"),
     ],
 )
 def test_archives_that_hold_no_policy_are_refused(tmp_path, changes, message):
@@ -147,7 +147,7 @@ def test_archives_that_hold_no_policy_are_refused(tmp_path, changes, message):
     np.savez(path, **arrays(**changes))
     with pytest.raises(ValueError, match=message) as caught:
         policies.load(path)
-    assert str(caught.value).startswith(f"{path} is no policy of rbl-gym")
+    assert str(caught.value).startswith(f"{path} is not a policy of rbl-gym")
 
 
 @pytest.mark.parametrize("damage", ["empty", "text", "half", "flipped", "array"])
@@ -168,7 +168,7 @@ def test_files_that_are_no_archive_are_refused(tmp_path, damage):
             np.save(file, np.zeros(3))
     else:
         path.write_bytes(content[damage])
-    with pytest.raises(ValueError, match="is no policy of rbl-gym"):
+    with pytest.raises(ValueError, match="is not a policy of rbl-gym"):
         policies.load(path)
     with pytest.raises(FileNotFoundError):
         policies.load(tmp_path / "none.npz")

@@ -61,7 +61,7 @@ def test_a_policy_whose_archive_points_before_its_begin(tmp_path):
     data = path.read_bytes()
     end = data.rindex(b"PK\x05\x06")
     path.write_bytes(data[: end + 16] + b"\xff\xff\xff\x0f" + data[end + 20 :])
-    with pytest.raises(ValueError, match=r"p.npz is no policy of rbl-gym: "):
+    with pytest.raises(ValueError, match=r"p.npz is not a policy of rbl-gym: "):
         policies.load(path)
 
 
@@ -80,8 +80,8 @@ def test_a_policy_whose_archive_points_before_its_begin(tmp_path):
         (lambda: batch.reset_mask({"reset_mask": [[1], [1, 2]]}, 2), "reset_mask must be an array"),
         (lambda: batch.seeds_of("ab", 2), "seed must be an int, a list of ints or None, got 'ab'"),  # pyright: ignore
         (lambda: batch.seeds_of([1], 2), r"seed must hold 2 seeds, got \[1\]"),
-        (lambda: batch.seeds_of([1, 1.5], 2), "seed must be an int that is not negative, or None"),  # pyright: ignore
-        (lambda: batch.seeds_of(-1, 2), "seed must be an int that is not negative, .* got -1"),
+        (lambda: batch.seeds_of([1, 1.5], 2), "seed must be a non-negative int or None"),  # pyright: ignore
+        (lambda: batch.seeds_of(-1, 2), "seed must be a non-negative int .* got -1"),
         (
             lambda: wrappers.EstimatePose(TrackingEnv(), options={1: 2}),  # pyright: ignore
             "options must be a dict by names, or None, got {1: 2}",

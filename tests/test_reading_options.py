@@ -210,4 +210,4 @@ def test_ranges_that_a_set_has_calibrated(monkeypatch):
     assert log.range_std is not None
     np.testing.assert_allclose(log.ranges[0].max(), 1.74375)
     np.testing.assert_allclose(log.range_std[0].max(), 0.11086)
-    assert log.report.notes == ("uwb.csv: columns that are not read: range.",)
+    assert log.report.notes == ("uwb.csv: columns not read: range.",)

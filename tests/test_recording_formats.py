@@ -76,7 +76,7 @@ def test_columns_are_mapped_and_others_are_named_once(tmp_path):
     log = read_as(tmp_path, text, columns=columns)
     np.testing.assert_array_equal(log.links, read(tmp_path).links)
     np.testing.assert_array_equal(log.ranges[log.links], 9.0)
-    assert note_of(log, "not read").endswith("ranges.csv: columns that are not read: range, rssi.")
+    assert note_of(log, "not read").endswith("ranges.csv: columns not read: range, rssi.")
 
 
 def test_a_column_that_is_mapped_and_not_there(tmp_path):
@@ -95,7 +95,9 @@ def test_a_column_that_is_mapped_and_not_there(tmp_path):
 
 def test_a_pair_of_columns_the_wrong_way_round(tmp_path):
     text = LONG.replace("t,", "zeit,", 1)
-    with pytest.raises(ValueError, match=r"'zeit' is no quantity; did you mean time=zeit\?$"):
+    with pytest.raises(
+        ValueError, match=r"'zeit' is not a known quantity; did you mean time=zeit\?$"
+    ):
         read_as(tmp_path, text, columns={"zeit": "time"})
     assert len(read_as(tmp_path, text, columns={"time": "zeit"}).times) == 2
     files = write(tmp_path, ranges=LONG, anchors=ANCHORS.replace("x", "ost", 1), tags=TAGS)
@@ -129,7 +131,7 @@ def test_units_of_time(tmp_path, unit, scale, start, step):
     for options in ({}, {"time_unit": unit}, {"columns": {"time": f"t[{unit}]"}}):
         log = read_as(tmp_path, text, **options)
         np.testing.assert_allclose(log.times, times, atol=1e-6)
-        said = any("are taken for" in note for note in log.report.notes)
+        said = any("are read as" in note for note in log.report.notes)
         assert said == (unit != "s" and not options)
 
 
@@ -159,11 +161,11 @@ def test_whole_numbers_some_units_apart(tmp_path, step):
     """Ticks at some hundred a second are likelier than a range every few seconds; both are said."""
     log = read(tmp_path, many(40, step))
     np.testing.assert_allclose(log.times, 1e-3 * step * np.arange(40))
-    assert "are taken for milliseconds" in note_of(log, f"{step} apart")
+    assert "are read as milliseconds" in note_of(log, f"{step} apart")
     for text in (many(12, step), many(40, step + 0.5)):
         log = read(tmp_path, text)
         assert log.times[1] == float(text.splitlines()[2].split(",")[0])
-        assert "taken for seconds; say the time unit ms" in note_of(log, "apart (median)")
+        assert "read as seconds; set the time unit to ms" in note_of(log, "apart (median)")
     assert read_as(tmp_path, many(40, step), time_unit="s").times[1] == step
 
 
@@ -253,7 +255,7 @@ def test_rows_out_of_order_are_sorted_and_counted(tmp_path):
         read_as(tmp_path, "\n".join(lines), strict=True)
     lines[9], lines[20] = lines[20], lines[9]
     with pytest.raises(
-        ValueError, match=r"line 21, column 't': time must not fall .* column run; another"
+        ValueError, match=r"line 21, column 't': time must not fall .* column run; or set"
     ):
         read(tmp_path, "\n".join(lines))
 
@@ -297,7 +299,9 @@ def test_no_header(tmp_path):
 
 def test_points_and_commas_in_one_column(tmp_path):
     text = many(5).replace(",", ";").replace("0.2;A;1;2.5", "0.2;A;1;2,5")
-    with pytest.raises(ValueError, match=r"ranges.csv, line 4: must have points or commas as dec"):
+    with pytest.raises(
+        ValueError, match=r"ranges.csv, line 4: must not mix points and commas as dec"
+    ):
         read(tmp_path, text)
 
 
@@ -322,7 +326,7 @@ def test_runs(tmp_path):
         assert_same(log, read_recording(**files, run=name))
         assert log.links.sum() == 5
         np.testing.assert_allclose(log.times, 0.1 * np.arange(5))
-    with pytest.raises(ValueError, match=r"has 2 runs, \['b', 'a'\]; read one"):
+    with pytest.raises(ValueError, match=r"has 2 runs, \['b', 'a'\]; choose one"):
         read_recording(**files)
     with pytest.raises(ValueError, match=r"has no run 'c', got \['b', 'a'\]"):
         read_recording(**files, run="c")
@@ -395,7 +399,7 @@ def test_anchors_that_move(tmp_path):
     assert gone.report.dropped == {"of an anchor whose place is not known then": 1}
     rare = "".join(f"A,{t},{t},0,1\n" for t in (0, 1, 2, 3, 9))
     holed = read(tmp_path, anchors="anchor,t,x,y,z\n" + rare + "B,0,4,0,1\nC,0,0,4,2\n")
-    assert "'A' has no place for 6 s (usually 1 s)" in note_of(holed, "meanwhile")
+    assert "'A' has no position for 6 s (usually 1 s)" in note_of(holed, "meanwhile")
     still = "anchor,t,x,y,z\nA,0,0,0,1\nA,9,0,0,1\nB,0,4,0,1\nC,0,0,4,2\n"
     np.testing.assert_array_equal(read(tmp_path, anchors=still).anchors, read(tmp_path).anchors)
     with pytest.raises(ValueError, match=r"anchors.csv, line 8, column 't': anchor 'A' may have"):
@@ -465,7 +469,7 @@ def test_ranges_between_two_bodies_seen_from_one(tmp_path):
 
 def test_a_carrier_that_is_nowhere(tmp_path):
     carrier = TRUTH.replace("\n0,", "\n9,").replace("\n1,", "\n10,")
-    message = r"carrier.csv: the carrier's pose is known at no time .* 0 to 0.1 s, its poses 9"
+    message = r"carrier.csv: the carrier has no pose at any time .* 0 to 0.1 s, poses 9"
     with pytest.raises(ValueError, match=message):
         read(tmp_path, carrier=carrier)
     log = read(tmp_path, LONG + "1.5,A,1,2\n", carrier=TRUTH)
@@ -486,7 +490,7 @@ def test_heights_that_nobody_tells(tmp_path):
 def test_a_calibration_without_slopes(tmp_path):
     log = read(tmp_path, calibration="anchor,tag,bias_m\nA,1,0.5\nC,1,3.5\n")
     np.testing.assert_allclose(log.ranges[0], [[2.0, 2.25], [0, 0], [0, 0]])
-    assert log.report.dropped == {"not positive once calibrated": 1}
+    assert log.report.dropped == {"not positive after calibration": 1}
     assert "1 ranges are not positive" in note_of(log, "calibrated")
 
 
@@ -501,15 +505,15 @@ def test_units_of_the_header_that_are_none(tmp_path):
     ("options", "message"),
     [
         ({"columns": {"lidar.x": "x"}}, "one of the files ranges, anchors, .*, got lidar.x=x"),
-        ({"columns": {"time": ""}}, "columns must be names by what they hold, .*, got time="),
+        ({"columns": {"time": ""}}, "columns must map a quantity, .*; got time="),
         (
             {"time_unit": "min"},
             r"time_unit must be one of \['s', 'ms', .*, got 'min'",
         ),
         ({"where": {"run": "7"}}, r"line 1: no column 'run' to choose by, got \['t', "),
         ({"where": {"anchor": "Z"}}, r"line 1: no row has anchor=Z, got \['A', 'B', 'C'\]"),
-        ({"columns": {"*": "B_*"}}, r"line 1: no column is like 'B_\*', got \['t', "),
-        ({"columns": {"*": "B_"}}, r"columns must name \* by what has a \*, got 'B_'"),
+        ({"columns": {"*": "B_*"}}, r"line 1: no column fits 'B_\*', got \['t', "),
+        ({"columns": {"*": "B_"}}, r"a column named \* needs a pattern with a \*, got 'B_'"),
         ({"columns": {"range": "r_{tag}"}}, "columns of links must be like .*, got 'r_{tag}'"),
     ],
 )

@@ -173,7 +173,7 @@ ERRORS = {
             "anchors": "id,x,y,z\n1,0,0,0\n1t2,1,0,0\n",
             "tags": "id,x,y,z\n3,0,0,0\n2t3,0,0,0\n",
         },
-        r"ranges.csv: column 'a1t2t3' fits two pairs",
+        r"ranges.csv: column 'a1t2t3' fits two links",
     ),
     "not a number": (
         {"ranges": LONG.replace("3.0", "three")},

@@ -57,7 +57,7 @@ def test_two_tags_give_their_line():
     assert found["axis_rmse_deg"] < 15
     assert found["centre_rmse_m"] < 0.2
     (note,) = [note for note in found["notes"] if "do not determine" in note]
-    assert "the rotation about the body's axis (" in note
+    assert "the rotation, except that about the body's axis (" in note
     axis = [float(x) for x in note.split("(")[1].split(")")[0].split(",")]
     np.testing.assert_allclose(axis, [0, 1, 0], atol=0.1)
     held = observed(result.track, tags)
@@ -107,14 +107,14 @@ def test_a_start_is_the_prior():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": (1, 2)}, "start must be x, y, z and perhaps yaw_deg, got 2 numbers"),
-        ({"prior_position_m": 1.0}, "prior_position_m means nothing without start"),
+        ({"start": (1, 2)}, "start must be x, y, z and optionally yaw_deg, got 2 numbers"),
+        ({"prior_position_m": 1.0}, "prior_position_m needs start"),
         ({"height_m": 1.0}, "height_m needs height_std_m, or planar"),
         ({"height_std_m": 1.0}, "height_std_m needs height_m"),
-        ({"planar": True, "tilt_std_deg": 1.0}, "planar holds height, roll and pitch: leave out"),
+        ({"planar": True, "tilt_std_deg": 1.0}, "must be left out with planar, which holds height"),
         (
             {"planar": True, "height_m": 1.0, "height_offset_m": 0.3},
-            "height_m and height_offset_m say the same",
+            "height_m and height_offset_m must not both be given",
         ),
         ({"drift_time_s": 0.0}, "drift_time_s"),
     ],

@@ -93,7 +93,9 @@ def test_gaps_in_both_are_named():
 
 def test_no_common_time_names_what_lies_between():
     times, rotation, place = moving(0.1)
-    with pytest.raises(ValueError, match=r"shares no time with the ranges: .* 5 s apart$"):
+    with pytest.raises(
+        ValueError, match=r"does not overlap with the ranges in time: .* 5 s apart$"
+    ):
         check_overlap(Truth(times[:20] + 14.9, rotation[:20], place[:20]), times, 0.5)
     with pytest.raises(ValueError, match="the truth's clock may be ahead by about 1700000000 s"):
         check_overlap(Truth(times + 1.7e9, rotation, place), times, 0.5)
@@ -194,4 +196,4 @@ def test_another_order_of_quaternions_is_hinted_for_planar_bodies():
     found = replay.track_errors(recording, track, settings)
     notes = replay.track_figures(recording, track, found, settings)["notes"]
     assert len(notes) == 1
-    assert re.search("quaternions look like x, y, z, w under the names w, x, y, z: ", notes[0])
+    assert re.search("quaternions look like x, y, z, w in columns named w, x, y, z: ", notes[0])

@@ -400,7 +400,10 @@ def test_good_rotations_pass(shape):
 @pytest.mark.parametrize(
     ("Q", "message"),
     [
-        (1.001 * np.eye(3), "start must be orthogonal, Q Q^T is off the identity by 0.002"),
+        (
+            1.001 * np.eye(3),
+            "start must be orthogonal, but Q Q^T differs from the identity by 0.002",
+        ),
         (np.stack([np.eye(3), np.diag([1, 1, -1])]), "start must be a proper rotation"),
         (np.eye(4), "start must have shape (..., 3, 3), got (4, 4)"),
         (np.full((3, 3), np.nan), "start must be finite, got nan at index (0, 0)"),

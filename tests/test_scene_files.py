@@ -247,7 +247,7 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("obstacles.0", 4, "obstacles[0] must be a table"),
         ("obstacles.0.low", [5, 2, 0], "obstacles[0]: low must lie below high"),
         ("obstacles.0.name", "rack", "obstacles[0] has an unknown key 'name'"),
-        ("obstacles", [{"low": [0, 0, 0], "high": [8, 6, 2]}], "obstacles[0] swallows the whole"),
+        ("obstacles", [{"low": [0, 0, 0], "high": [8, 6, 2]}], "obstacles[0] covers the whole"),
         (
             "obstacles",
             [{"low": [0, 0, -1], "high": [4, 6, 2]}, {"low": [4, 0, -1], "high": [8, 6, 2]}],
@@ -261,7 +261,7 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("body", {"tags": [[0, 0, 0], [1, 1, 0], [2, 2, 0]]}, "tags must be at least 3 and not on"),
         ("body", {"tags": [[0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "tags must be at least 3 and not on"),
         ("body", {"tags": [[0, 0]]}, "body.tags must have shape"),
-        ("body", {"tags": [[0, 0, 0]], "size_m": 1}, "body.size_m means nothing"),
+        ("body", {"tags": [[0, 0, 0]], "size_m": 1}, "body.size_m must be left out"),
         ("noise.floor_m", -0.1, "noise: floor_m must be a finite number"),
         ("noise.proportional", -0.1, "noise: proportional must be a finite number"),
         ("noise.floor_m", 0, "noise: floor_m and proportional must not both be zero"),
@@ -284,7 +284,7 @@ def test_what_is_wrong_in_a_file_is_named(path, value, message):
 def test_anchors_without_a_legal_place():
     tables = changed("anchors", {"kind": "box", "low": [0, 0, 3], "high": [2, 2, 3], "number": 4})
     tables["obstacles"] = [{"low": [-1, -1, 2.5], "high": [3, 3, 4]}]
-    with pytest.raises(ValueError, match="anchors have no legal place"):
+    with pytest.raises(ValueError, match="anchors have no permitted place"):
         scene_files.of_mapping(tables)
 
 

@@ -236,10 +236,10 @@ def test_unknown_scene_is_refused(scene, message):
 BOX = {"kind": "box", "low": [0, 0, 0], "high": [1, 1, 1]}
 REFUSED: list[tuple[dict[str, Any], str]] = [
     # unknown fields
-    ({"speed": 3}, "scene has no field 'speed'; it has anchor_region, anchor_speed_m_s"),
+    ({"speed": 3}, "scene has no field 'speed'; its fields are anchor_region, anchor_speed_m_s"),
     ({"noise": {"floor": 1}}, "scene.noise has no field 'floor'; it has floor_m, proportional"),
     ({"noise": {"kind": "range", "floor": 1}}, "scene.noise:"),
-    ({"dt": {"value": 1}}, "scene.dt is not a nested field, got a dict {'value': 1}"),
+    ({"dt": {"value": 1}}, "scene.dt must be a value, not a dict of fields, got {'value': 1}"),
     ({"noise": 0.1}, "scene.noise must be a dict of its fields, got 0.1"),
     ({"links": None}, "scene.links must be a dict of its fields, got None"),
     # kinds
@@ -271,7 +271,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"trajectory": "loop"}, "trajectory must be one of 'waypoints', 'constant', 'random-twist'"),
     ({"prior": "none"}, "prior must be one of 'drawn', 'start', got 'none'"),
     # arrays
-    ({"anchors": [[1, 2, 3]], "n_anchors": 2}, "anchors must hold n_anchors = 2 places, got 1"),
+    ({"anchors": [[1, 2, 3]], "n_anchors": 2}, "anchors must hold n_anchors = 2 positions, got 1"),
     ({"anchors": [[1, 2, np.nan]]}, "anchors must be finite, got nan at index (0, 2)"),
     ({"anchors": [[1, 2]]}, "anchors must have shape (..., M, 3), got (1, 2)"),
     ({"anchors": 5}, "anchors must"),

@@ -95,7 +95,7 @@ def test_settings_of_a_replay_by_group_and_by_name():
     assert replay.Settings.of(**named) == grouped
     assert grouped.flat() == {**replay.Settings().flat(), **named}
     assert grouped.changed(walk_m=0.1).motion == replay.Motion()
-    with pytest.raises(ValueError, match="settings have no 'walk'; they have filter, "):
+    with pytest.raises(ValueError, match="settings have no field 'walk'; the fields are filter, "):
         replay.Settings.of(walk=0.1)
 
 

@@ -328,5 +328,5 @@ def test_a_policy_that_cannot_be_played_is_refused(tmp_path):
     with pytest.raises(ValueError, match="reference"):
         learned_program(path, "nobody")
     (tmp_path / "none.npz").write_text("")
-    with pytest.raises(ValueError, match="no policy"):
+    with pytest.raises(ValueError, match="not a policy"):
         learned_program(str(tmp_path / "none.npz"))

@@ -168,8 +168,8 @@ ID = "RBL/AnchorPlacement-v0"
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ([], "SCENE|FILE is missing"),
-        (["--watch"], "SCENE|FILE is missing"),
+        ([], "SCENE|FILE must be given"),
+        (["--watch"], "SCENE|FILE must be given"),
         (["uwb_room", "--anchors", "x.csv"], "--anchors must be a number"),
         (["--ranges", "r.csv", "--anchors", "4"], "--anchors must be a file"),
         (["uwb_room", "--ranges", "r.csv"], "must be left out"),

@@ -94,7 +94,7 @@ def test_what_is_wrong_is_named(tmp_path):
         write_track(tmp_path / "track.csv", track()._replace(covariance=np.zeros((COUNT, 3, 3))))
     path = tmp_path / "track.csv"
     path.write_text("t,x,y,z\n0,1,2,3\n")
-    with pytest.raises(ValueError, match=r"track\.csv: a track needs rotations"):
+    with pytest.raises(ValueError, match=r"track\.csv: a track must have rotations"):
         read_track(path)
     write_track(path, track())
     text = path.read_text()

@@ -43,7 +43,7 @@ def test_families_from_files(tmp_path):
     [
         ("a.json", "[{]", r"a\.json: .*line 1 column 3"),
         ("a.toml", "x = = 1", r"a\.toml: .*line 1, column 5"),
-        ("a.json", "[]", "holds no scenes"),
+        ("a.json", "[]", "must hold at least one scene"),
         ("a.json", '["hall", {"steps": 3}]', "scene 1 must be a name or a table"),
         ("a.yaml", "", r"must come from a \.json or \.toml file"),
     ],

@@ -104,13 +104,13 @@ def test_columns_are_mapped_and_what_is_not_read_is_named(tmp_path):
     assert isinstance(found, Truth)
     path.write_text("t,x,y,z,speed\n" + rows(TIMES, PLACES, [7, 7, 7]))
     read_truth(path, said=(said := Said()))
-    assert said.report().notes == (f"{path}: columns that are not read: speed.",)
+    assert said.report().notes == (f"{path}: columns not read: speed.",)
 
 
 QUATERNION = "t,x,y,z,qw,qx,qy,qz\n"
 REFUSED = {
-    "no unit of the angle": ("t,x,y,yaw\n1,1,1,1\n", "line 1: column 'yaw' must tell its unit"),
-    "both units": ("t,x,y,yaw_deg,yaw_rad\n1,1,1,1,1\n", "column 'yaw' must tell its unit"),
+    "no unit of the angle": ("t,x,y,yaw\n1,1,1,1\n", "line 1: column 'yaw' must state its unit"),
+    "both units": ("t,x,y,yaw_deg,yaw_rad\n1,1,1,1,1\n", "column 'yaw' must state its unit"),
     "half a quaternion": ("t,x,y,z,qw,qx\n1,1,1,1,1,0\n", "line 1: missing column 'qy'"),
     "roll alone": ("t,x,y,z,roll_deg\n1,1,1,1,1\n", "line 1: missing column 'pitch_deg'"),
     "no pitch": ("t,x,y,z,roll_deg,yaw_deg\n1,1,1,1,1,1\n", "missing column 'pitch_deg'"),
@@ -145,6 +145,6 @@ def test_a_recording_takes_it(tmp_path):
     assert log.truth.form == "TUM, poses"
     (tmp_path / "c.csv").write_text("t,x,y,z\n" + rows(TIMES, PLACES))
     for relative in (False, True):
-        with pytest.raises(ValueError, match=r"c\.csv: a carrier needs rotations"):
+        with pytest.raises(ValueError, match=r"c\.csv: the poses of a carrier must have rotations"):
             read_recording(tmp_path / "r.csv", tmp_path / "a.csv", truth=tmp_path / "t.tum",
                            carrier=tmp_path / "c.csv", relative=relative)  # fmt: skip

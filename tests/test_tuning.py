@@ -95,7 +95,9 @@ def test_options_of_the_filter_are_kept_and_printed():
 
 
 def test_a_log_too_short_to_tune_by_is_refused():
-    with pytest.raises(ValueError, match=r"first 0\.5 s must have 10 epochs to tune by, got 6"):
+    with pytest.raises(
+        ValueError, match=r"first 0\.5 s must have at least 10 epochs for tuning, got 6"
+    ):
         replay.tune(recording(RANGES), SETTINGS, seconds=0.5)
     with pytest.raises(ValueError, match="seconds"):
         replay.tune(recording(RANGES), SETTINGS, seconds=-1.0)

@@ -158,8 +158,8 @@ def scene_of(env: Any) -> Scene:
     scene = getattr(unwrapped, "scene", None)
     if not isinstance(scene, Scene):
         raise ValueError(
-            "env must have a rbl_gym Scene as its scene, as RBL/Tracking-v0 has and tasks with a "
-            f"filter of their own or without one have not, got {unwrapped!r}"
+            "env must have a rbl_gym Scene as its scene, as RBL/Tracking-v0 has; tasks that run "
+            f"a filter themselves have none, got {unwrapped!r}"
         )
     return scene
 
@@ -205,7 +205,10 @@ def named_filter(
     if not isinstance(filter, Mapping):
         return parse_filter(filter, check_options_of(options))
     if options is not None:
-        raise ValueError(f"options must be in the dict of the filter, got {options!r:.80} besides")
+        raise ValueError(
+            "options must be None if filter is a dict, which holds the options; got "
+            f"{options!r:.80}"
+        )
     told = dict(filter)
     name = told.pop("name", None)
     if not isinstance(name, str):
@@ -258,7 +261,7 @@ def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
     for key in ("name", "tags", "noise", "process"):
         if key in options:
             raise ValueError(
-                f"options must not have {key!r}, which the wrapper gives, got {options!r:.80}"
+                f"options must not have {key!r}, which the wrapper sets, got {options!r:.80}"
             )
     return dict(options)
 
@@ -266,7 +269,9 @@ def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
 def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
     """Raise ValueError if obstacles vary the noise law and the filter does not support that."""
     if scene.weakens:
-        check_takes_noise(name, filter, "the scene's obstacles give every epoch its own noise")
+        check_takes_noise(
+            name, filter, "the scene's obstacles change the noise from epoch to epoch"
+        )
 
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -29,9 +29,9 @@ def filter_of(env: Any, task: PlacementTask, name: str, options: Any) -> Filter:
     """Return the filter of a task; raises ValueError if it does not suit the scene."""
     filter = make_filter(env, task.scene, name, options)
     if reads(filter) != "twist":
-        raise ValueError(f"filter must be one that is told the twist, got {name!r}")
+        raise ValueError(f"filter must be one that takes the twist, got {name!r}")
     if task.racks:
-        check_takes_noise(name, filter, "the racks give every epoch its own noise")
+        check_takes_noise(name, filter, "the racks change the noise from epoch to epoch")
     return filter
 
 

@@ -238,7 +238,7 @@ def check_determined(task: PlacementTask, name: str, filter: Filter) -> None:
     if not best.max() < _FORGOTTEN:
         axis = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
         raise ValueError(
-            f"filter must be one that {task.n_anchors} anchors and the {len(scene.tags)} tags of "
-            f"scene {scene.name!r} determine, got {name!r}: {axis[int(best.argmax())]} stays what "
-            "the prior says"
+            f"filter {name!r} does not determine {axis[int(best.argmax())]} with {task.n_anchors} "
+            f"anchors and the {len(scene.tags)} tags of scene {scene.name!r}, where it only "
+            "repeats the prior: choose another filter"
         )

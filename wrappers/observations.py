@@ -221,8 +221,8 @@ class Viewer:
         needed = {"angles", "station"} if "angles" in keys else {"ranges", "links", "anchors"}
         if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
             raise ValueError(
-                "env must observe ranges, links, anchors and twist, or angles, station and twist, "
-                f"its space is {inner}"
+                "env must observe ranges, links, anchors and twist, or angles, station and "
+                f"twist, got the space {inner}"
             )
         m, n = 1, len(scene.body[0] if scene.body.ndim > 2 else scene.body)
         if "ranges" in keys:

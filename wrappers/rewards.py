@@ -138,12 +138,12 @@ def _with_options(options: dict[str, Any]) -> Reward:
     for name, value in options.items():
         if name not in known:
             raise ValueError(
-                f"reward {kind!r} has no option {name!r:.80}; it has "
+                f"reward {kind!r} has no option {name!r:.80}; its options are "
                 f"{', '.join([*known, 'action_price'])}"
             )
         check_number(f"reward.{name}", value, low=0.0)
     if kind == "requirement" and not options:
-        raise ValueError("reward 'requirement' needs position_m, rotation_deg or both")
+        raise ValueError("reward 'requirement' needs position_m or rotation_deg, or both")
 
     def paid(outcome: Outcome) -> FloatArray:
         value = function(outcome, **options)

@@ -109,7 +109,9 @@ class Sb3VecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Not supported: the worlds have no attributes of their own."""
-        raise NotImplementedError("the worlds of a native vector environment share attributes")
+        raise NotImplementedError(
+            "the worlds of a native vector environment have no attributes of their own"
+        )
 
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
@@ -118,7 +120,9 @@ class Sb3VecEnv(VecEnv):
         if method_name == "action_masks":
             masks = self.envs.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
             return [masks[i] for i in self._get_indices(indices)]
-        raise NotImplementedError("the worlds of a native vector environment share methods")
+        raise NotImplementedError(
+            "the worlds of a native vector environment have no methods of their own"
+        )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """Return whether the infos contain the data of Monitor; there is no other wrapper."""

@@ -267,8 +267,8 @@ def _subsets(m: int, k: int) -> BoolArray:
     count = math.comb(m, k)
     if count > _MOST_SUBSETS:
         raise ValueError(
-            f"mode 'subset' must have at most {_MOST_SUBSETS} subsets, {k} of {m} anchors have "
-            f"{count}"
+            f"mode 'subset' allows at most {_MOST_SUBSETS} subsets, but {k} of {m} anchors can be "
+            f"chosen in {count} ways"
         )
     found = np.zeros((count, m), np.bool_)
     for row, chosen in zip(found, itertools.combinations(range(m), k), strict=True):

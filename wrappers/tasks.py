@@ -54,7 +54,7 @@ class _MobileAnchors(Task):
         found = family_of_task(scenes, scene, "auv_craft", **level)
         worlds = (world_of(scene, **level),) if found is None else found.corners
         if any(one.anchor_speed_m_s <= 0 for one in worlds):
-            raise ValueError("scene must have anchors that move, got anchor_speed_m_s = 0")
+            raise ValueError("scene must have moving anchors, got anchor_speed_m_s = 0")
         if not isinstance(sort_craft, bool):
             raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
         self.sort_craft = sort_craft

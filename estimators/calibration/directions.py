@@ -306,7 +306,9 @@ def locate_by_directions(
     mask = np.asarray(links, dtype=bool) & (ranges > 0)
     anchors, tags = check_array("anchors", anchors, ("M", 3)), check_array("tags", tags, ("N", 3))
     if level.height_m is None or level.height_std_m is None or level.tilt_std_rad is None:
-        raise ValueError(f"level must tell height and tilt, got {level!r:.200}")
+        raise ValueError(
+            f"level must have height_m, height_std_m and tilt_std_rad, got {level!r:.200}"
+        )
     rotation, translation = _starts(ranges, mask, anchors, level.height_m)
     told = _Told(level.height_m, level.height_std_m, level.tilt_std_rad)
     data = (ranges, mask, anchors, tags, model, told)

@@ -113,7 +113,10 @@ def inertial_clock(
     search_s = check_number("search_s", search_s, low=0.0)
     windows = _windows(times, readings, float(told.times[0]), _SLOW_S)
     if np.ptp(told.times) < _WINDOW_S or not windows:
-        raise ValueError(f"imu and ranges must last {_WINDOW_S:g} s without gaps: give the offset")
+        raise ValueError(
+            f"imu and ranges must last {_WINDOW_S:g} s without gaps to estimate the offset: give "
+            "the offset"
+        )
     arms = np.zeros_like(told.tags)
     path: Any = start
     first_s, slow = float(told.times[0]), _SLOW_S
@@ -220,8 +223,8 @@ def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, 
     tried = (seconds >= 0.5 * seconds.max()) & (np.abs(offsets - near_s) <= search_s + 1e-9)
     if not tried.any():
         raise ValueError(
-            f"imu and ranges must have more in common than they have within {search_s:g} s of an "
-            f"offset of {near_s:g} s: give a rough offset"
+            f"imu and ranges overlap too little at offsets within {search_s:g} s of {near_s:g} s: "
+            "give a rough offset"
         )
     score = np.where(tried, score, 0.0)
     best = int(np.argmax(score))
@@ -233,7 +236,7 @@ def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, 
         )
     if best in np.flatnonzero(tried)[[0, -1]]:
         raise ValueError(
-            f"{what} best at {offsets[best]:+.2f} s, the end of what is tried: give a rough offset"
+            f"{what} best at {offsets[best]:+.2f} s, the end of the search: give a rough offset"
         )
     elsewhere = np.where(np.abs(offsets - offsets[best]) > _PEAK_S, score, 0.0)
     rival = int(np.argmax(elsewhere))

@@ -62,7 +62,9 @@ def range_track(
     )
     anchors = check_array("anchors", anchors, ("K", 3))
     if not len(times) == len(ranges) == len(std) == len(anchors) or (np.diff(times) < 0).any():
-        raise ValueError("times must not decrease, and ranges, std and anchors be as many")
+        raise ValueError(
+            "times must not decrease, and ranges, std and anchors must have one entry for each time"
+        )
     length = check_number("length of times", float(times[-1] - times[0]), low=2 * _KNOT_S)
     count = int(np.ceil(length / _KNOT_S))
     knots = times[0] + length / count * np.arange(-3, count + 4)

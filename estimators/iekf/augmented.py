@@ -227,8 +227,8 @@ class AugmentedEkf:
         if have:
             n_tags = self.pose.tags.shape[-2]
             raise ValueError(
-                f"anchors must be the {have // len(self.biases) // n_tags} whose biases the state "
-                f"holds, got {shape[0]}"
+                f"the number of anchors must be {have // len(self.biases) // n_tags}, as the "
+                f"state holds that many biases of each tag, got {shape[0]}"
             )
         batch, n = state.extra.shape[:-1], state.covariance.shape[-1]
         total = n + links * len(self.biases)

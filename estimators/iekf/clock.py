@@ -54,7 +54,7 @@ class ClockEkf(AugmentedEkf):
         if not isinstance(self.clock, Clock):
             raise ValueError(f"clock must be a Clock, got {self.clock!r:.80}")
         if self.pose.offset is not None:
-            raise ValueError(f"offset must be None beside a clock, got {self.pose.offset!r}")
+            raise ValueError(f"offset must be None with a clock, got {self.pose.offset!r}")
 
     def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:
         """Return the state, with clocks, after `dt` seconds.
@@ -182,7 +182,9 @@ class ClockEkf(AugmentedEkf):
             return state
         if have > first:
             held = self._n_clocks(have)
-            raise ValueError(f"anchors must be the {held} whose clocks the state holds, got {n}")
+            raise ValueError(
+                f"the number of anchors must be {held}, the number of clocks in the state, got {n}"
+            )
         batch, start = guess.shape[:-2], 6 + first
         total = start + biases + 2 * n
         P = np.zeros((*batch, total, total))

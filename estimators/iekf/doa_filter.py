@@ -125,7 +125,9 @@ class DoaEkf(IteratedEkf):
         if ranges is not None:
             range_law = self.range_noise if range_noise is None else range_noise
             if range_law is None:
-                raise ValueError("range_noise must be given to the filter that takes ranges")
+                raise ValueError(
+                    "range_noise must be given, at the filter or in this update, to use ranges"
+                )
             anchors = station[..., None, :] if anchors is None else anchors
             ranges, anchors, mask = check_epoch(ranges, anchors, range_links, self.tags)
             of_ranges = 1 / check_variance(range_law.variance(ranges, mask), mask)
@@ -234,15 +236,15 @@ def iterated_ekf(
     if measurement == "doa":
         for name, told in (("offset", offset), ("clock", clock), ("anchor_std_m", anchor_std_m)):
             if told is not None:
-                raise ValueError(f"{name} must be None where angles are measured, got {told!r:.80}")
+                raise ValueError(f"{name} must be None with angles, got {told!r:.80}")
         return DoaEkf(tags, noise, process, iterations, robust, range_noise=range_noise)
     if range_noise is not None:
-        raise ValueError("range_noise must be None where noise is the law of the ranges")
+        raise ValueError("range_noise must be None if noise is the law of the ranges")
     filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
     if anchor_std_m is None:
         return filter if clock is None else ClockEkf(filter, clock=clock)
     if clock is not None:
-        raise ValueError(f"clock must be None beside anchor_std_m, got {clock!r:.80}")
+        raise ValueError(f"clock must be None with anchor_std_m, got {clock!r:.80}")
     return SurveyedEkf(filter, anchor_std_m=anchor_std_m)
 
 

@@ -52,7 +52,7 @@ class SurveyedEkf(AugmentedEkf):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.biases:
-            raise ValueError(f"biases must be empty beside anchor_std_m, got {self.biases!r:.80}")
+            raise ValueError(f"biases must be empty with anchor_std_m, got {self.biases!r:.80}")
         anchor_deviations(self.anchor_std_m, (*np.shape(self.anchor_std_m), 1)[0])
 
     @functools.cached_property
@@ -146,7 +146,8 @@ class SurveyedEkf(AugmentedEkf):
             return state
         if have:
             raise ValueError(
-                f"anchors must be the {have // 3} whose places the state holds, got {anchors}"
+                f"the number of anchors must be {have // 3}, the number of positions in the "
+                f"state, got {anchors}"
             )
         std = anchor_deviations(self.anchor_std_m, anchors)
         std = np.zeros((anchors, 3)) if std is None else std

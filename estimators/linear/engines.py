@@ -273,8 +273,8 @@ def engine_for(name: str, **arrays: tuple[int, ...]) -> type[Batched] | type[Fil
     if many:
         key, batch = next(iter(many.items()))
         raise ValueError(
-            f"engine 'filterpy' tracks one body, got a {key} with leading axes {batch}; "
-            "use engine='batched'"
+            f"engine 'filterpy' tracks only one body, got a {key} with leading axes {batch}; use "
+            "engine='batched'"
         )
     return FilterPy
 

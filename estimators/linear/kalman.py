@@ -283,9 +283,9 @@ class KalmanFamily:
         if ((rank < 12) & vague).any():
             raise ValueError(
                 f"anchors and tags determine only rank {int(rank.min())} of the filter's 12 "
-                f"states (it needs 4 anchors and 4 tags, neither coplanar), and the prior is "
-                f"too vague to stand in; got {anchors.shape[-2]} anchors, "
-                f"{self.tags.shape[-2]} tags. Use 'iekf', or a tighter prior covariance"
+                "states (it needs 4 anchors and 4 tags, neither coplanar), and the prior is too "
+                f"wide for the missing states; got {anchors.shape[-2]} anchors, "
+                f"{self.tags.shape[-2]} tags. Use 'iekf', or a smaller prior covariance"
             )
 
 

@@ -116,9 +116,7 @@ def locate_doa(
     if tags.shape[-2] < 3 or (spanned_dimensions(tags) < 2).any():
         raise ValueError(f"tags must be at least 3 and not collinear, got shape {tags.shape}")
     if (np.ptp(tags, axis=-2).max(axis=-1) < _SMALLEST_BODY_M).any():
-        raise ValueError(
-            f"tags must be a body of at least {_SMALLEST_BODY_M:g} m, got {tags!r:.80}"
-        )
+        raise ValueError(f"tags must span at least {_SMALLEST_BODY_M:g} m, got {tags!r:.80}")
     angles = bearing.check_angles(angles, tags.shape[-2])
     where = np.zeros(3) if station is None else check_array("station", station, (3,))
     batch = np.broadcast_shapes(angles.shape[:-2], tags.shape[:-2], where.shape[:-1])

@@ -294,19 +294,19 @@ _NEEDS = {"ls": (3, 3), "ls-projected": (3, 3)} | dict.fromkeys(
 def _check_offset(method: str, offset: str, tag_std_m: float) -> None:
     """Raise ValueError if a method does not support the ranges' offsets."""
     if method not in METHODS:
-        raise ValueError(f"offset goes with the methods {', '.join(METHODS)}, got {method!r}")
+        raise ValueError(f"offset needs one of the methods {', '.join(METHODS)}, got {method!r}")
     if tag_std_m != 0:
-        raise ValueError(f"offset goes with tag_std_m 0, got {tag_std_m!r}")
+        raise ValueError(f"offset needs tag_std_m = 0, got {tag_std_m!r}")
     if offset == "anchor" and method not in ("ml", "robust"):
-        raise ValueError(f"offset 'anchor' goes with the methods 'ml' and 'robust', got {method!r}")
+        raise ValueError(f"offset 'anchor' needs method 'ml' or 'robust', got {method!r}")
 
 
 def _check_geometry(method: str, epoch: StaticEpoch) -> None:
     anchors, tags = epoch.anchors, epoch.tags
     if epoch.offset is not None and anchors.shape[-2] < 5:
         raise ValueError(
-            f"method {method!r} needs 5 anchors where ranges have an unknown offset, got "
-            f"{anchors.shape[-2]}; 'ml' takes any geometry and says what it determines"
+            f"method {method!r} needs 5 anchors for ranges with an unknown offset, got "
+            f"{anchors.shape[-2]}; method 'ml' takes any geometry and returns its rank"
         )
     needs = zip(("anchors", "tags"), (anchors, tags), _NEEDS[method], strict=True)
     for name, points, needed in needs:
@@ -314,8 +314,8 @@ def _check_geometry(method: str, epoch: StaticEpoch) -> None:
         if rank < needed:
             raise ValueError(
                 f"method {method!r} needs {name} that span {needed} dimensions, got "
-                f"{points.shape[-2]} of rank {rank}; 'ml' takes any geometry and says what it "
-                "determines"
+                f"{points.shape[-2]} of rank {rank}; method 'ml' takes any geometry and returns "
+                "its rank"
             )
 
 

@@ -215,9 +215,8 @@ def _solves(C: sp.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
 def _contradiction(branch: NDArray[Any]) -> str:
     named = np.rint(branch).astype(int).tolist()
     return (
-        f"branch: the multiples of 2 pi of dependent cycles contradict each other, got "
-        f"{named!s:.80}; give that of consistent angles psi, rint(C psi / 2 pi), or "
-        "independent cycles"
+        "branch: the multiples of 2 pi of dependent cycles contradict each other, got "
+        f"{named!s:.80}; give rint(C psi / 2 pi) of consistent angles psi, or independent cycles"
     )
 
 
@@ -373,7 +372,9 @@ def _step(C: sp.csr_matrix, kappa: float | str | None, one_by_one: bool) -> floa
 def _whole(branch: ArrayLike, size: int) -> FloatArray:
     array = check_array("branch", branch, (size,)) if size else np.zeros(0)
     if (array != np.rint(array)).any():
-        raise ValueError(f"branch must be {size} whole numbers, one a cycle, got {branch!r:.80}")
+        raise ValueError(
+            f"branch must be {size} whole numbers, one for each cycle, got {branch!r:.80}"
+        )
     return array
 
 

@@ -81,7 +81,7 @@ def orientations(
     edges = check_connected(edges, n_nodes)
     y = check_edge_angles(y, edges)
     if options and method != "cycle":
-        raise ValueError(f"options are of the method 'cycle' only, got {sorted(options)}")
+        raise ValueError(f"options are allowed only with the method 'cycle', got {sorted(options)}")
     if weights is not None:
         if method not in _WEIGHTED:
             raise ValueError(

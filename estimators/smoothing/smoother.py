@@ -136,7 +136,7 @@ class LogModel:
         if not isinstance(self.clock, Clock | None):
             raise ValueError(f"clock must be a Clock or None, got {self.clock!r:.80}")
         if self.clock is not None and self.offset is not None:
-            raise ValueError(f"offset must be None beside a clock, got {self.offset!r}")
+            raise ValueError(f"offset must be None with a clock, got {self.offset!r}")
         for law in self.biases:
             if not isinstance(law, LinkBias):
                 raise ValueError(f"biases must be a tuple of LinkBias, got {law!r:.80}")
@@ -221,7 +221,7 @@ def smooth(
     covariances = equations.covariances()
     P, _, constants = covariances
     if not np.isfinite(P).all():
-        raise ValueError("log and prior must tell of every state, some have no information")
+        raise ValueError("log and prior must determine every state, but some have no information")
     squares, freedom = problem.ranges.consistency(state, losses[-1], covariances)
     if model.motion.turning:
         P = _of_errors(P, state)

@@ -44,7 +44,9 @@ def causal_track(
     """
     times = check_array("times", log.times, ("K",))
     if times.ndim != 1:
-        raise ValueError(f"times must be (K,) for a filter, got shape {times.shape}")
+        raise ValueError(
+            f"times must have shape (K,) to start from a filter, got shape {times.shape}"
+        )
     ranges, anchors = np.asarray(log.ranges, float), np.asarray(log.anchors, float)
     twists = np.zeros((len(times) - 1, 6)) if twists is None else np.asarray(twists, float)
     state: Any = filter.initial(*prior)  # pyright: ignore[reportArgumentType]

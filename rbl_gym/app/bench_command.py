@@ -25,35 +25,37 @@ def add_bench(commands: Any) -> None:
     """Add the parser of ``rbl-gym bench``."""
     bench = commands.add_parser(
         "bench",
-        help="the leaderboard: every filter on every scene",
-        description="Monte Carlo of filters on scenes, as they are and under stress, with the "
-        "same noise for all: accuracy beside the bound, honesty, failures, time. A run that was "
-        "stopped goes on where it was. See docs/leaderboard.md.",
+        help="compare filters on scenes: the leaderboard",
+        description="Run filters on scenes by Monte Carlo, under nominal conditions and under "
+        "stress, with the same noise for all filters. Report accuracy and the bound, consistency, "
+        "failures and computing time. A run that was stopped continues where it stopped. See "
+        "docs/leaderboard.md.",
     )
     bench.add_argument(
         "--filters",
         type=names,
         metavar="A,B",
-        help=f"{FILTER_HELP}; default all but iekf-bank, iekf-bias, iekf-cv, iekf-imu and "
-        "iekf-log, with iekf/robust=true, and those made for a scene",
+        help=f"{FILTER_HELP}; default: all except iekf-bank, iekf-bias, iekf-cv, iekf-imu and "
+        "iekf-log, with iekf/robust=true and the filters made for one scene",
     )
     bench.add_argument(
         "--scenes",
         type=names,
         metavar="A,B",
-        help="names, or files .toml or .json: a scene with changes, or a recording; default all "
-        "named ones, and those with an inertial sensor, time differences or a survey",
+        help="scenes: a name, or a .toml or .json file with a changed scene or a recording; "
+        "default: all named scenes, and those with an inertial sensor, time differences or "
+        "surveyed anchors",
     )
-    bench.add_argument("--conditions", type=names, metavar="A,B", help="default all")
+    bench.add_argument("--conditions", type=names, metavar="A,B", help="conditions, default all")
     add_trials(bench, 200)
     bench.add_argument(
         "--out",
         default="out/bench.jsonl",
         metavar="F",
-        help="records, one a line; default out/bench.jsonl",
+        help="file of the records, one on each line; default out/bench.jsonl",
     )
-    bench.add_argument("--fresh", action="store_true", help="do not take up what F holds")
-    add_html(bench, "page: maps, sortable table")
+    bench.add_argument("--fresh", action="store_true", help="drop the records that F already has")
+    add_html(bench, "page with maps and a sortable table")
     _add_workers(bench)
     add_json(bench)
     bench.set_defaults(run=_bench)
@@ -63,19 +65,23 @@ def add_rerun(commands: Any) -> None:
     """Add the parser of ``rbl-gym rerun``."""
     rerun = commands.add_parser(
         "rerun",
-        help="the records of a bench once more, and what differs",
-        description="Run again what made a file of rbl-gym bench; status 1 if a figure differs.",
+        help="repeat the runs of a bench file and compare the results",
+        description=(
+            "Repeat all runs of a file of rbl-gym bench. The exit status is 1 if a result differs."
+        ),
     )
-    rerun.add_argument("file", metavar="FILE", help="of rbl-gym bench")
+    rerun.add_argument("file", metavar="FILE", help="records, written by rbl-gym bench")
     _add_workers(rerun)
     add_json(rerun)
     rerun.set_defaults(run=_rerun)
 
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--jobs", type=positive, default=1, help="processes, default 1")
-    parser.add_argument("--backend", choices=backends.BACKENDS, help="of joblib, default loky")
-    parser.add_argument("--address", metavar="A", help="of an existing dask or ray cluster")
+    parser.add_argument("--jobs", type=positive, default=1, help="number of processes, default 1")
+    parser.add_argument(
+        "--backend", choices=backends.BACKENDS, help="backend of joblib, default loky"
+    )
+    parser.add_argument("--address", metavar="A", help="address of an existing dask or ray cluster")
 
 
 def _bench(options: argparse.Namespace) -> int:
@@ -116,7 +122,7 @@ def _rerun(options: argparse.Namespace) -> int:
     path = Path(options.file)
     records = bench_files.read_records(path)
     if not records:
-        raise ValueError(f"{path} holds no record of rbl-gym bench")
+        raise ValueError(f"{path}: must have a record of rbl-gym bench, has none")
     with progress("rerun", len(records)) as advance:
         result = bench_files.rerun(records, workers=workers, advance=advance)
     if write_json(result, options.json):

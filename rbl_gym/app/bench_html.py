@@ -48,18 +48,18 @@ def bench(result: dict[str, Any]) -> str:
         "Which filter? The leaderboard",
         [
             page.note(
-                f"{_trials(rows)} of each row, seed {first['seed']}, the same motion, "
-                "prior and noise for all filters of a scene. Colours and numbers of the maps: "
-                "RMS tag error over the posterior Cramer-Rao bound; 1 is as good as it gets, "
-                "from 30 on a filter is lost."
+                f"{_trials(rows)} in each row, seed {first['seed']}. All filters of a scene have "
+                "the same motion, prior and noise. Colours and numbers of the maps: RMS tag "
+                "error over the posterior Cramer-Rao bound. 1 is the best possible value; from "
+                "30 on, a filter is lost."
             ),
             *([page.plot(_maps(simulated), "maps")] if simulated else []),
             page.note(f"Conditions. {conditions}."),
             page.table(f"{len(rows)} rows", _HEADINGS, [_cells(row) for row in rows]),
             page.note(
                 "Root mean squares over trials and epochs; median and 95th percentile of the tag "
-                "error. ANEES per degree of freedom: 1 is honest, more is optimistic. Times are "
-                "of the machine that ran it."
+                "error. ANEES per degree of freedom: 1 is consistent, more is optimistic. Times "
+                "are those of the machine that ran the benchmark."
             ),
         ],
     )

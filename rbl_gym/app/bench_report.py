@@ -50,9 +50,9 @@ def print_bench(result: dict[str, Any]) -> None:
     for name in stress:
         console.print(f"{name}: {result['conditions'][name]}")
     console.print(
-        "Root mean squares over trials and epochs; median, p95 and what follows are of the tag "
-        "error.\nANEES: per degree of freedom, 1 is honest; + optimistic, - pessimistic. "
-        "Stress: tag RMSE (m), then ANEES, then trials lost."
+        "Root mean squares over trials and epochs; median, p95 and the columns after them are of "
+        "the tag error.\nANEES: per degree of freedom, 1 is consistent; + optimistic, - "
+        "pessimistic. Stress: tag RMSE (m), then ANEES, then trials lost."
     )
 
 
@@ -135,15 +135,18 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
     first = next(iter(conditions.values()))
     lines = []
     if first["status"] == "unobservable":
-        lines.append(f"{name}: cannot observe this scene, {_rank(first)}: it leans on its prior")
+        lines.append(
+            f"{name}: does not determine the pose in this scene, {_rank(first)}: it depends on "
+            "its prior"
+        )
     for condition, row in conditions.items():
         if row["message"]:
             lines.append(f"{name}, {condition}: {row['status']} {row['message']}")
     rates = [rate for row in conditions.values() if (rate := row.get("trigger_rate")) is not None]
     if any(0 < rate < 1 for rate in rates):
         lines.append(
-            f"{name}: triggered at {100 * rates[0]:.0f} % of the updates, "
-            f"{100 * max(rates):.0f} % where most"
+            f"{name}: triggered at {100 * rates[0]:.0f} % of the updates, in the worst condition "
+            f"at {100 * max(rates):.0f} %"
         )
     return lines
 

@@ -15,16 +15,19 @@ def add_bounds(commands: Any) -> None:
     """Add the parser of ``rbl-gym bounds``."""
     bounds = commands.add_parser(
         "bounds",
-        help="what an inertial sensor, a better survey, calibrated links would buy",
-        description="Posterior Cramer-Rao bounds along a track of a scene: by what tells the "
-        "motion (ranges alone, a told twist, inertial sensors), and by what is not known (places "
-        "of the anchors to 1, 3, 10 cm, biases of the links, offsets of the tags). No filter is "
-        "run. See docs/hard_conditions.md.",
+        help="accuracy bounds with better sensors, surveys and calibrations",
+        description="Compute posterior Cramer-Rao bounds along a track of a scene, for several "
+        "sources of the motion (ranges alone, a known twist, inertial sensors) and several "
+        "unknowns (anchor positions to 1, 3 and 10 cm, biases of the links, offsets of the tags). "
+        "No filter is run. See docs/hard_conditions.md.",
     )
     bounds.add_argument(
         "--scene",
         default="uwb_room",
-        help="a name, or a file .toml or .json with changes, as of bench; default uwb_room",
+        help=(
+            "name of a scene, or a .toml or .json file with a changed scene, as for bench; "
+            "default uwb_room"
+        ),
     )
     add_trials(bounds, 20)
     add_json(bounds)
@@ -37,7 +40,9 @@ def _bounds(options: argparse.Namespace) -> int:
 
     spec = next(iter(spec_files.scene_specs([options.scene]).values()))
     if isinstance(spec, dict) and "ranges" in spec:
-        raise ValueError(f"{Path(options.scene)}: a recording has no bound; name a scene")
+        raise ValueError(
+            f"{Path(options.scene)}: must be a scene, got a recording, for which there is no bound"
+        )
     with progress("bounds") as advance:
         result = what_if.what_if(spec, options.trials, options.seed, advance)
     if write_json(result, options.json):
@@ -53,8 +58,8 @@ def _print(result: dict[str, Any]) -> None:
     unknowns = list(dict.fromkeys(unknown for _, unknown in rows))
     for key, label, n in (("position_m", "position (m)", 3), ("rotation_deg", "rotation (deg)", 3)):
         table = new_table(
-            f"{result['scene']}: bound of {label}, {result['epochs']} epochs, "
-            f"{result['trials']} trials; in brackets: of their second half"
+            f"{result['scene']}: bound of {label}, {result['epochs']} epochs, {result['trials']} "
+            "trials; in brackets: the second half of the epochs"
         )
         table.add_column("not known")
         for motion in motions:
@@ -69,7 +74,7 @@ def _print(result: dict[str, Any]) -> None:
     law = result["uncalibrated"]
     console.print(
         "One sigma of all three axes together, root mean square over trials and epochs. Ranges "
-        "alone: nothing but a law of the accelerations is known of the motion. Biases of links: "
-        f"{100 * law['std_m']:g} cm each and {100 * law['common_std_m']:g} cm common to all, "
-        "constant; they and the anchors' places are learned on the way."
+        "alone: the motion is known only by a law of the accelerations. Biases of links: "
+        f"constant, {100 * law['std_m']:g} cm for each link and {100 * law['common_std_m']:g} cm "
+        "common to all. Biases and anchor positions are estimated along with the pose."
     )

@@ -14,23 +14,29 @@ def add_calibrate(commands: Any) -> None:
     """Add the parser of ``rbl-gym calibrate``."""
     calibrate = commands.add_parser(
         "calibrate",
-        help="biases, lever arms, clock and noise by truth; without truth the anchors' places",
-        description="With --truth: biases and slopes of links, tags, clocks, noise, bias by the "
-        "direction of the ray, and with --imu how the inertial sensor sits. Without it: anchors "
-        "surveyed by the ranges of a moving body. See docs/calibration.md.",
+        help=(
+            "calibrate biases, lever arms, clock and noise with truth, or survey the anchors "
+            "without"
+        ),
+        description="With --truth: estimate biases and slopes of links, tag positions, clock "
+        "offsets, noise and bias by the direction of the ray; with --imu also the axes of the "
+        "inertial sensor. Without --truth: estimate the anchor positions from the ranges of "
+        "a moving body. See docs/calibration.md.",
     )
     add_reading(calibrate)
-    _add_plane(calibrate.add_argument_group("what is known of the body's place"))
-    with_truth = calibrate.add_argument_group("what is estimated with --truth")
+    _add_plane(calibrate.add_argument_group("knowledge of the body's position"))
+    with_truth = calibrate.add_argument_group("model of the links (with --truth)")
     _add_links(with_truth)
     _add_directions(with_truth)
     _add_truth(calibrate.add_argument_group("the truth"))
-    _add_anchors(calibrate.add_argument_group("anchors surveyed without --truth"))
+    _add_anchors(calibrate.add_argument_group("survey of the anchors (without --truth)"))
     output = calibrate.add_argument_group("output")
     output.add_argument(
-        "--out", metavar="DIR", help="folder of calibration.csv, tags.csv, ..., which replay reads"
+        "--out", metavar="DIR", help="folder for calibration.csv, tags.csv, ..., which replay reads"
     )
-    output.add_argument("--plot", metavar="F", help="picture of the links and their residuals")
+    output.add_argument(
+        "--plot", metavar="F", help="picture of the biases and residuals of the links"
+    )
     add_json(output)
     calibrate.set_defaults(run=_calibrate)
 
@@ -40,22 +46,22 @@ def _add_links(group: Any) -> None:
         "--model",
         dest="biases",
         choices=("auto", "link", "node", "common"),
-        help="biases of every link, of every anchor and tag (antenna delays), or one of all; "
-        "default auto: of links that have ranges enough, else of nodes",
+        help="one bias for each link, for each anchor and tag (antenna delays), or for all links; "
+        "default auto: for links if they have enough ranges, else for nodes",
     )
     group.add_argument(
         "--no-slopes",
         dest="slopes",
         action="store_false",
         default=None,
-        help="ranges grow as distances do",
+        help="no scale errors: ranges grow by as much as distances",
     )
     group.add_argument(
         "--arms",
         dest="tags_model",
         choices=("held", "turned", "free"),
-        help="the table of tags holds; is turned and shifted as a whole (default); or every tag is "
-        "found by itself",
+        help="held: the table of tags is exact; turned: it is turned and shifted as a whole "
+        "(default); free: every tag position is estimated",
     )
 
 
@@ -64,13 +70,16 @@ def _add_directions(group: Any) -> None:
         "--harmonics",
         type=int,
         metavar="N",
-        help="bias by the direction in which a ray leaves the body: at most so many harmonics of "
-        "its bearing, as many as foretell what was left out; default 0, none",
+        help="bias by the direction in which a ray leaves the body: largest number of harmonics "
+        "of its bearing; cross-validation chooses the number; default 0, none",
     )
     group.add_argument(
         "--ends",
         choices=("tags", "both"),
-        help="directions at the tags (default), or at both ends: the anchors are on a body too",
+        help=(
+            "tags: directions at the tags (default); both: at the anchors too, if they are "
+            "on a body"
+        ),
     )
 
 
@@ -79,14 +88,17 @@ def _add_plane(group: Any) -> None:
         "--planar",
         action="store_true",
         default=None,
-        help="a body in a level plane: only the heading of the truth is read; anchors keep their "
-        "heights",
+        help="the body moves in a level plane: only the heading of the truth is used, and anchors "
+        "keep their heights",
     )
     group.add_argument(
         "--height-offset-m",
         type=float,
         metavar="X",
-        help="of the tags' mean height below the anchors', where no truth tells heights",
+        help=(
+            "depth of the tags below the anchors (difference of the mean heights), metres; "
+            "needed if the truth has no heights"
+        ),
     )
 
 
@@ -95,19 +107,22 @@ def _add_truth(group: Any) -> None:
         "--time-offset",
         type=offset,
         metavar="S",
-        help="how far the truth's clock is ahead of that of the ranges, seconds; default auto: "
-        "found, up to 1 s",
+        help="how far the clock of the truth is ahead of the clock of the ranges, seconds; "
+        "default auto: estimated, up to 1 s",
     )
     group.add_argument(
-        "--truth-gap-s", type=float, metavar="X", help="longest gap that is bridged, default 0.5"
+        "--truth-gap-s",
+        type=float,
+        metavar="X",
+        help="longest gap of the truth that is interpolated, seconds, default 0.5",
     )
     group.add_argument(
         "--truth-exclude",
         type=window,
         action="append",
         metavar="START:END",
-        help="seconds (of the ranges' clock) in which the truth is wrong; may be given more than "
-        "once",
+        help="interval with wrong truth, seconds by the clock of the ranges; may be given several "
+        "times",
     )
 
 
@@ -115,18 +130,27 @@ def _add_anchors(group: Any) -> None:
     group.add_argument(
         "--start",
         choices=("table", "ranges"),
-        help="the places in --anchors are rough (default); or nothing is known of them",
+        help=(
+            "table: the positions in --anchors are rough (default); ranges: nothing is known "
+            "of them"
+        ),
     )
     group.add_argument(
-        "--known", type=_names, metavar="ID,ID,...", help="anchors whose places in --anchors hold"
+        "--known",
+        type=_names,
+        metavar="ID,ID,...",
+        help="anchors whose positions in --anchors are exact",
     )
     group.add_argument(
-        "--anchor-ranges", metavar="F", help="anchor_a,anchor_b,range: between anchors"
+        "--anchor-ranges", metavar="F", help="ranges between anchors: anchor_a,anchor_b,range"
     )
     for name, text in (
-        ("--bias-m", "bias that all ranges have in common, default 0"),
-        ("--bias-std-m", "how well it is known, default 0.5"),
-        ("--link-std-m", "of what each link has beside it, default 0.05"),
+        ("--bias-m", "bias common to all ranges, metres, default 0"),
+        ("--bias-std-m", "standard deviation of this common bias, metres, default 0.5"),
+        (
+            "--link-std-m",
+            "standard deviation of the other biases, one for each link, metres, default 0.05",
+        ),
     ):
         group.add_argument(name, type=float, metavar="X", help=text)
 
@@ -154,14 +178,16 @@ _WITHOUT = {
 def _calibrate(options: argparse.Namespace) -> int:
     for name in ("calibration", "directions"):
         if getattr(options, name) is not None:
-            raise ValueError(f"calibrate takes ranges as the radios gave them, without --{name}")
+            raise ValueError(f"calibrate needs ranges without corrections: leave out --{name}")
     if options.imu_frame is not None:
-        raise ValueError("calibrate finds the axes of --imu: leave out --imu-frame")
+        raise ValueError("calibrate estimates the axes of --imu: leave out --imu-frame")
     if options.imu is not None and not options.truth:
-        raise ValueError("--imu means nothing without --truth")
+        raise ValueError("--imu needs --truth")
     mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
     if wrong := [option for name, option in others.items() if getattr(options, name) is not None]:
-        raise ValueError(f"{wrong[0]} means nothing with{'' if options.truth else 'out'} --truth")
+        raise ValueError(
+            f"{wrong[0]} {'must be left out with' if options.truth else 'needs'} --truth"
+        )
     names = [*mine, "planar", "height_offset_m"]
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     found = (_links if options.truth else _anchors)(options, given)
@@ -219,7 +245,7 @@ def _anchors(options: argparse.Namespace, given: dict[str, Any]) -> Any:
     runs = read_runs(options)
     if len(runs) > 1:
         raise ValueError(
-            f"anchors are surveyed by one run, and {options.ranges} has {len(runs)}, "
+            f"a survey needs a single run, but {options.ranges} has {len(runs)}, "
             f"{[*runs]!r:.200}: choose one by --run"
         )
     (recording,) = runs.values()

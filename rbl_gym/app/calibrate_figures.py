@@ -108,7 +108,7 @@ def _histogram(axes: Any, found: CalibratedLinks) -> None:
     bell = len(e) * width / std / np.sqrt(2 * np.pi) * np.exp(-0.5 * (middle / std) ** 2)
     axes.plot(middle, np.maximum(bell, 0.5), color="#d1495b", label=f"Gaussian, {std:.3f} m")
     axes.set_yscale("log")
-    axes.set_xlabel("residual [m], the ends hold what is beyond")
+    axes.set_xlabel("residual [m], larger ones in the outermost bins")
     axes.set_ylabel("ranges")
     axes.legend(frameon=False, fontsize=8)
 

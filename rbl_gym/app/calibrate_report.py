@@ -56,7 +56,7 @@ def _print_links(figures: dict[str, Any]) -> None:
         )
     console.print(table)
     if "nodes" in figures:
-        table = new_table("antenna delays of nodes, those of the tags about their mean")
+        table = new_table("antenna delays of nodes, those of the tags relative to their mean")
         table.add_column("node")
         for heading in ("delay [m]", "+-"):
             table.add_column(heading, justify="right")
@@ -81,14 +81,15 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
     said = []
     if clock := figures["time_offset"]:
         said.append(
-            f"The ranges fit the truth {clock['offset_s']:.4f} s later than its stamps say, +- "
-            f"{clock['std_s']:.4f} (replay --time-offset {clock['offset_s']:.4f})."
+            f"The clock of the truth is ahead of that of the ranges by {clock['offset_s']:.4f} s, "
+            f"+- {clock['std_s']:.4f} (replay --time-offset {clock['offset_s']:.4f})."
         )
     if sensor := figures.get("inertial"):
         said.append(
-            f"The axes of imu are turned by {_three(sensor['rotation_vector_deg'], 2)} deg against "
-            f"the body's, +- {_three(sensor['rotation_std_deg'], 2)} (replay --imu-frame); its "
-            f"clock is ahead of that of the ranges by {sensor['imu_offset_s']:.4f} s, +- "
+            "The axes of the inertial sensor are turned by "
+            f"{_three(sensor['rotation_vector_deg'], 2)} deg against the body's, +- "
+            f"{_three(sensor['rotation_std_deg'], 2)} (replay --imu-frame); its clock is ahead of "
+            f"that of the ranges by {sensor['imu_offset_s']:.4f} s, +- "
             f"{sensor['imu_offset_std_s']:.4f} (replay --time-offset imu=...)."
         )
     if turn := figures.get("turn"):
@@ -101,13 +102,20 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
             said.append(f"Tag {row['tag']} is {_three(off, 3)} m off its place in the table.")
     if told := figures.get("directions"):
         kind = told["bias"]
-        text = "Bias by the direction of the ray: no harmonic foretells what was left out."
+        text = (
+            "Bias by the direction of the ray: none, as no harmonic improves the prediction of "
+            "held-out ranges."
+        )
         if kind["harmonics"]:
-            whose = "one law for all antennas of a body" if kind["shared"] else "of each by itself"
+            whose = (
+                "the same for all antennas of a body"
+                if kind["shared"]
+                else "separate for each antenna"
+            )
             text = (
                 f"Bias by the direction of the ray: {kind['harmonics']} harmonics at "
                 f"{'both ends' if kind['ends'] == 'both' else 'the tags'}, {whose}; they explain "
-                f"{100 * told['explained']:.0f} % of the variance of ranges left out."
+                f"{100 * told['explained']:.0f} % of the variance of held-out ranges."
             )
         said.append(text)
     noise = figures["noise"]
@@ -117,7 +125,10 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
             f", {100 * noise['slow_share']:.0f} % of its variance slow, over "
             f"{noise['slow_time_s']:.2g} s"
         )
-    said.append(f"{text}; {100 * noise['beyond_3_std']:.1f} % of the ranges beyond three of it.")
+    said.append(
+        f"{text}; {100 * noise['beyond_3_std']:.1f} % of the ranges are off by more than three "
+        "standard deviations."
+    )
     said += [f"Not determined: {what}." for what in figures["not_determined"]]
     return said
 

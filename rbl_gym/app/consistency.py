@@ -26,8 +26,8 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
     if found is None:
         return
     console.print(
-        f"NIS per degree of freedom {found['nis_per_dof']:.2f} (1: honest), log-likelihood "
-        f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % refused"
+        f"NIS per degree of freedom {found['nis_per_dof']:.2f} (1: consistent), log-likelihood "
+        f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % rejected"
     )
     table = new_table("residuals after the update")
     table.add_column("")
@@ -46,8 +46,8 @@ def tuned_text(found: dict[str, Any]) -> str:
     """Return the tuned values as command line options."""
     return (
         f"tuned on {found['epochs']} epochs of the first {found['seconds']:.1f} s: "
-        f"{found['options']} (log-likelihood per range {found['log_likelihood']:.3f}, with the "
-        f"settings given {found['log_likelihood_before']:.3f})"
+        f"{found['options']} (log-likelihood per range {found['log_likelihood']:.3f}, "
+        f"{found['log_likelihood_before']:.3f} before tuning)"
     )
 
 
@@ -72,7 +72,7 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     found = replayed.track.innovations
     assert found is not None
     when, ratio, low, high = nis_curve(replayed.track.times, found)
-    axes.fill_between(when, low, high, color="0.85", lw=0, label="95 % of an honest filter")
+    axes.fill_between(when, low, high, color="0.85", lw=0, label="95 % of a consistent filter")
     ratio = np.clip(ratio, 1e-3, 1e6)
     axes.plot(when, ratio, color=_HONEST, lw=0.8)
     axes.axhline(1.0, color="0.5", lw=0.6)
@@ -101,14 +101,14 @@ def consistency_parts(replayed: Replayed) -> list[str]:
     residuals = found["residuals"]
     tuned = replayed.figures.get("tuned")
     parts = [
-        "<h2>Is the filter at one with its data?</h2>",
+        "<h2>Does the filter fit its data?</h2>",
         page.note(
             "Normalised innovation squared (NIS) per degree of freedom "
-            f"{found['nis_per_dof']:.2f} (1: honest; far above: the filter is told too little "
-            "noise or motion, or wrong places), log-likelihood "
-            f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % of the "
-            "ranges refused. Residuals are those after the update: mean of the ranges used, spread "
-            "of all (1.48 times the median distance from the median)."
+            f"{found['nis_per_dof']:.2f} (1: consistent; far above: the filter assumes too little "
+            f"noise or motion, or wrong positions), log-likelihood {found['log_likelihood']:.2f} "
+            f"per range, {100 * found['refused_share']:.1f} % of the ranges rejected. Residuals "
+            "are those after the update: mean of the ranges used, spread of all (1.48 times the "
+            "median distance from the median)."
         ),
         page.plot(_charts(replayed), "consistency", first=False),
     ]

@@ -21,14 +21,17 @@ def add_convert(commands: Any) -> None:
     """Add the parser of ``rbl-gym convert``."""
     convert = commands.add_parser(
         "convert",
-        help="a bag of ROS 1 or ROS 2, or an MCAP file, as files for replay",
-        description="Write ranges.csv and what else the log holds (anchors, tags, truth, imu, "
-        "odometry). Known message types need no option; see docs/bags.md.",
+        help="convert a ROS 1 or ROS 2 bag, or an MCAP file, to files for replay",
+        description="Write ranges.csv, and anchors, tags, truth, imu and odometry if the log has "
+        "them. Known message types need no option; see docs/bags.md.",
     )
     convert.add_argument(
-        "log", nargs="+", metavar="LOG", help="x.bag ..., a folder of ROS 2, x.db3 or x.mcap"
+        "log",
+        nargs="+",
+        metavar="LOG",
+        help="one or several x.bag, the folder of a ROS 2 bag, x.db3 or x.mcap",
     )
-    convert.add_argument("--out", metavar="DIR", help="folder of the files")
+    convert.add_argument("--out", metavar="DIR", help="folder for the files")
     convert.add_argument(
         "--list",
         nargs="?",
@@ -36,13 +39,19 @@ def add_convert(commands: Any) -> None:
         metavar="TOPIC",
         help="show the topics, or the fields of a topic, and write nothing",
     )
-    convert.add_argument("--map", metavar="F", help="TOML: tables ranges, truth, imu, odometry")
+    convert.add_argument(
+        "--map",
+        metavar="F",
+        help="TOML file with the options below as tables: ranges, truth, imu, odometry",
+    )
     for kind, text in _KINDS.items():
         convert.add_argument(
             f"--{kind}", metavar="KEY=VALUE,...", type=_table, help=f"{text}; or none"
         )
     convert.add_argument(
-        "--messages", metavar="DIR", help="PACKAGE/msg/NAME.msg, where the log holds no definitions"
+        "--messages",
+        metavar="DIR",
+        help="folder with PACKAGE/msg/NAME.msg, if the log has no message definitions",
     )
     add_json(convert)
     convert.set_defaults(run=_convert)
@@ -68,7 +77,9 @@ def _convert(options: argparse.Namespace) -> int:
             convert_report.print_topics(topics)
         return 0
     if options.out is None:
-        raise ValueError("--out DIR is missing: the folder of the files (--list only shows topics)")
+        raise ValueError(
+            "--out DIR must be given, the folder for the files (--list only shows topics)"
+        )
     with progress("reading", sum(row["messages"] for row in topics if row["read_as"])) as advance:
         result = bags.convert_bag(options.log, options.out, mapping, options.messages, advance)
     if write_json(result, options.json):
@@ -86,7 +97,7 @@ def _table(text: str) -> dict[str, Any]:
             key, part = name.strip(), value
             if not key or key in table:
                 raise argparse.ArgumentTypeError(
-                    f"must be KEY=VALUE,..., each key once, got {text!r}"
+                    f"must be KEY=VALUE,... with each key once, got {text!r}"
                 )
         values = table.get(key, [])
         table[key] = [*(values if isinstance(values, list) else [values]), part] if values else part

@@ -110,11 +110,11 @@ def print_doa2019(result: dict[str, Any]) -> None:
             )
         out.print(table)
     out.print(
-        "RMSE and ratios are of the trials near the truth: both errors within 6 times the bound.\n"
-        "The paper says neither what a success is nor how its PSO and PSA were set; both\n"
-        "definitions here, near the truth and an error of t below 0.5 m, are ours. At 1 degree\n"
-        "the bound of t itself is 0.41 m for R = I. Iterations: median and largest of the trials\n"
-        "that converged."
+        "RMSE and ratios are of the trials near the truth: both errors within 6 times the "
+        "bound.\nThe paper says neither what a success is nor how its PSO and PSA were set; "
+        "both\ndefinitions here, near the truth and an error of t below 0.5 m, are ours. At 1 "
+        "degree\nthe bound of t itself is 0.41 m for R = I. Iterations: median and largest of "
+        "the trials\nthat converged."
     )
 
 

@@ -96,7 +96,7 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
         if key == "nees":
             low, high = nees_interval(result["trials"])
             ax.axhspan(low, high, color="0.85", zorder=0)
-            title = "grey: 95 % of an honest filter, "
+            title = "grey: 95 % of a consistent filter, "
         else:
             ax.set_yscale("log")
             for axis_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
@@ -165,7 +165,7 @@ def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
             )
     axes.set_xlabel("updates that project [%]")
     axes.set_ylabel("rotation RMSE (Frobenius)")
-    axes.set_title("ET-KF's trade, labelled by threshold", fontsize=9)
+    axes.set_title("ET-KF: accuracy against projections, labelled by threshold", fontsize=9)
     axes.grid(alpha=0.25, lw=0.5)
 
 

@@ -55,7 +55,7 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                     color=_COLOURS[label],
                     ms=4,
                 )
-        axis.set(xlabel="epochs later", ylabel="trials that are back [%]", ylim=(-3, 103))
+        axis.set(xlabel="epochs later", ylabel="trials recovered [%]", ylim=(-3, 103))
         axis.set_title(f"{name}: 180 degrees, 10 m off", fontsize=9)
     handles = axes[-1].get_legend_handles_labels()
     lower.legend(*handles, frameon=False, fontsize=9, loc="outside lower center", ncols=6)
@@ -99,7 +99,7 @@ def print_hard(result: dict[str, Any]) -> None:
             table.add_section()
         console.print(table)
     after = result["starts"]["after"]
-    table = new_table(f"trials that are back so many epochs later, {result['trials']} trials")
+    table = new_table(f"recovered trials (%) after so many epochs, {result['trials']} trials")
     for heading in ("scene", "start", "filter"):
         table.add_column(heading)
     for heading in (*map(str, after), "us / step"):
@@ -112,7 +112,8 @@ def print_hard(result: dict[str, Any]) -> None:
         table.add_section()
     console.print(table)
     console.print(
-        "clean, good: posterior Cramer-Rao bounds of all links on straight paths, and of the\n"
-        "straight ones that were there. Lost, at the last epoch or ever: the square of an error\n"
-        "in the bound's covariance is above 100, where 6 is the mean; back: below it."
+        "clean, good: posterior Cramer-Rao bounds with all links on straight paths, and with "
+        "the\nstraight links that were measured. Lost, at the last epoch or ever: the squared "
+        "error\nnormalised by the bound's covariance is above 100 (its mean is 6); recovered: "
+        "below it."
     )

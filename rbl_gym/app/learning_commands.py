@@ -27,15 +27,23 @@ def add_train(commands: Any) -> None:
     """Add the parser of ``rbl-gym train``."""
     train = commands.add_parser(
         "train",
-        help="learn a policy (extra rl)",
-        description="Train a policy on a task; the same seed gives the same policy.",
+        help="train a policy (needs the extra rl)",
+        description="Train a policy on a task. The same seed gives the same policy.",
     )
     train.add_argument("task", choices=sorted(TASKS))
     _add_worlds(train)
-    train.add_argument("--algorithm", choices=list(ALGORITHMS), help="default: the task's own")
-    train.add_argument("--steps", type=positive, help="default: what the task's figures took")
+    train.add_argument(
+        "--algorithm",
+        choices=list(ALGORITHMS),
+        help="learning algorithm; default: that of the task",
+    )
+    train.add_argument(
+        "--steps",
+        type=positive,
+        help="number of steps; default: that of the results in docs/learning.md",
+    )
     add_seed(train)
-    train.add_argument("--out", metavar="F", help="default out/TASK-SEED.npz")
+    train.add_argument("--out", metavar="F", help="file of the policy, default out/TASK-SEED.npz")
     add_json(train)
     train.set_defaults(run=_train)
 
@@ -44,11 +52,11 @@ def add_evaluate(commands: Any) -> None:
     """Add the parser of ``rbl-gym evaluate``."""
     evaluate = commands.add_parser(
         "evaluate",
-        help="policies and references on held-out worlds",
+        help="score policies and references on held-out worlds",
         description="Score policies against the references on held-out worlds, with 95 % "
         "intervals of the paired bootstrap.",
     )
-    _add_players(evaluate, list(TASKS), worlds=_WORLDS, references="all of the task's")
+    _add_players(evaluate, list(TASKS), worlds=_WORLDS, references="all of the task")
     add_json(evaluate)
     evaluate.set_defaults(run=_evaluate)
 
@@ -57,9 +65,9 @@ def add_transfer(commands: Any) -> None:
     """Add the parser of ``rbl-gym transfer``."""
     transfer = commands.add_parser(
         "transfer",
-        help="layouts rolled through real filters",
-        description="Track moving bodies among anchors placed by policies and references: does "
-        "what is good by the bound track well?",
+        help="check layouts of policies by tracking bodies with filters",
+        description="Track moving bodies among anchors placed by policies and references. This "
+        "checks whether layouts with a good bound also track well.",
     )
     placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
     _add_players(transfer, placements, worlds=48, references="random, ring, greedy-swaps, hybrid")
@@ -74,10 +82,12 @@ def _add_worlds(parser: argparse.ArgumentParser) -> None:
     """Add options for the worlds of the task."""
     worlds = parser.add_mutually_exclusive_group()
     worlds.add_argument(
-        "--scene", metavar="NAME|F", help="another scene: its name, or a JSON or TOML file"
+        "--scene", metavar="NAME|F", help="another scene: a name, or a JSON or TOML file"
     )
     worlds.add_argument(
-        "--scenes", metavar="F", help="scenes to draw from: a list, or one with laws (JSON, TOML)"
+        "--scenes",
+        metavar="F",
+        help="JSON or TOML file with scenes to draw from: a list, or one scene with laws",
     )
 
 
@@ -106,11 +116,13 @@ def _add_players(
         action="append",
         default=[],
         metavar="F",
-        help="of rbl-gym train; may be given again",
+        help="file of a policy, from rbl-gym train; may be given several times",
     )
-    parser.add_argument("--references", metavar="A,B", help=f"default {references}")
-    parser.add_argument("--worlds", type=positive, default=worlds, help=f"default {worlds}")
-    add_seed(parser, "which worlds")
+    parser.add_argument("--references", metavar="A,B", help=f"references, default {references}")
+    parser.add_argument(
+        "--worlds", type=positive, default=worlds, help=f"number of worlds, default {worlds}"
+    )
+    add_seed(parser, "seed of the worlds")
 
 
 def _train(options: argparse.Namespace) -> int:

@@ -12,18 +12,21 @@ def add_network(commands: Any) -> None:
     """Add the parser of ``rbl-gym network``."""
     network = commands.add_parser(
         "network",
-        help="orientations of a planar network or pose graph",
-        description="Maximum-likelihood orientations from edge angles, their cost, and whether "
-        "it is proved that none are better. See docs/networks.md for the file formats.",
+        help="estimate the orientations of a planar network or pose graph",
+        description="Compute maximum-likelihood orientations from edge angles and their cost, and "
+        "try to certify that they are the global optimum. See docs/networks.md for the file "
+        "formats.",
     )
-    network.add_argument("file", metavar="FILE", help=".g2o, or CSV: i,j and dtheta (or a,b)")
+    network.add_argument(
+        "file", metavar="FILE", help="a .g2o file, or CSV with columns i,j and dtheta (or a,b)"
+    )
     network.add_argument(
         "--weights",
         choices=("information", "unit"),
         default="information",
-        help="of the edges: the file's information of theta (default), or all alike",
+        help="weights of the edges: information of theta in the file (default), or equal weights",
     )
-    network.add_argument("--plot", metavar="F", help="picture: the graph and the residuals")
+    network.add_argument("--plot", metavar="F", help="picture of the graph and the residuals")
     add_json(network)
     network.set_defaults(run=_network)
 

@@ -43,14 +43,14 @@ def print_network(result: dict[str, Any]) -> None:
     proof = (
         "certified: no other orientations cost less"
         if result["certified"]
-        else "NOT certified: others may cost less"
+        else "NOT certified: other orientations may cost less"
     )
     out.print(f"{result['nodes']} nodes, {result['edges']} edges, {result['loops']} loops")
     if result["skipped_lines"]:
         lines = ", ".join(f"{count} {kind}" for kind, count in result["skipped_lines"].items())
         out.print(f"skipped, no planar poses: {lines}")
     without = result["edges_without_weight"]
-    left_out = f"; {without} edges left out, without information of theta" if without else ""
+    left_out = f"; {without} edges without information of theta are left out" if without else ""
     out.print(f"weights: {result['weights']}{left_out}")
     out.print(
         f"cost {result['cost']:.10g}, sum of weight x residual^2 (along a tree: "

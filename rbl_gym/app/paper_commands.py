@@ -20,12 +20,17 @@ def add_demo(commands: Any) -> None:
     """Add the parser of ``rbl-gym demo``."""
     demo = commands.add_parser(
         "demo",
-        help="the tracking paper's experiment: five filters against the bound",
-        description="Monte-Carlo tracking of a rigid body (CAMSAP 2013): a table, a picture.",
+        help="compare five filters with the bound: the experiment of the tracking paper",
+        description=(
+            "Track a rigid body in Monte Carlo trials (CAMSAP 2013); print a table and draw "
+            "a picture."
+        ),
     )
     add_trials(demo)
-    demo.add_argument("--plot", default="out/demo.png", metavar="F", help="default out/demo.png")
-    add_html(demo, "3-D page of a trial, charts and tables")
+    demo.add_argument(
+        "--plot", default="out/demo.png", metavar="F", help="picture, default out/demo.png"
+    )
+    add_html(demo, "page with a trial in 3-D, charts and tables")
     add_json(demo)
     demo.set_defaults(run=_demo)
 
@@ -56,16 +61,18 @@ def add_reproduce(commands: Any) -> None:
 
     reproduce = commands.add_parser(
         "reproduce",
-        help="an experiment of a paper, or our own: tables, figures, CSV",
+        help="reproduce an experiment of a paper: tables, figures, CSV",
         description="; ".join(f"{name}: {e.summary}" for name, e in experiments().items()),
     )
     reproduce.add_argument("experiment", choices=sorted(experiments()))
     add_trials(reproduce)
-    reproduce.add_argument("--plot", metavar="F", help="default out/EXPERIMENT.png")
-    reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
+    reproduce.add_argument("--plot", metavar="F", help="picture, default out/EXPERIMENT.png")
+    reproduce.add_argument("--csv", metavar="F", help="CSV file with all results, one on each row")
     network = reproduce.add_argument_group("network2009")
     network.add_argument(
-        "--positions", metavar="F", help="CSV, header x,y: fixed points, the reference first"
+        "--positions",
+        metavar="F",
+        help="CSV file of fixed points with the header x,y, the reference first",
     )
     network.add_argument(
         "--footprint",
@@ -79,7 +86,7 @@ def add_reproduce(commands: Any) -> None:
         "--variance",
         metavar="S2",
         type=float,
-        help="of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01",
+        help="variance of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01",
     )
     add_json(reproduce)
     reproduce.set_defaults(run=_reproduce)
@@ -92,7 +99,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     named = ("positions", "footprints", "variance")
     given = {name: getattr(options, name) for name in named if getattr(options, name) is not None}
     if wrong := [name for name in given if name not in experiment.options]:
-        raise ValueError(f"{options.experiment} takes no {' and no '.join(wrong)}")
+        raise ValueError(f"{options.experiment} has no option {' and no option '.join(wrong)}")
     with progress(options.experiment) as advance:
         result = experiment.run(options.trials, options.seed, advance, **given)
     from rbl_gym.app import figures

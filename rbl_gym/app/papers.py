@@ -57,7 +57,8 @@ def experiments() -> dict[str, Experiment]:
     """Return all experiments by name."""
     return {
         "camsap2013": Experiment(
-            "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
+            "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), thresholds of "
+            "ET-KF",
             _tracking,
             _camsap2013_figure,
             _shown("reports", "print_camsap2013"),

@@ -49,15 +49,15 @@ def headline(result: dict[str, Any]) -> str:
     met = sum(zone["verdict"] == "pass" for zone in asked)
     if len(asked) == 1:
         words = {
-            "pass": "the zone gets what it asks for",
-            "fail": "the zone does not get what it asks for",
-            "undecided": "too close to the requirement to tell",
+            "pass": "the zone meets its requirement",
+            "fail": "the zone does not meet its requirement",
+            "undecided": "undecided: too close to the required share",
         }[overall]
         return f"{count}: {words}"
     if met == len(asked):
         every = "both" if met == 2 else f"all {met}"
-        return f"{count}: {every} zones get what they ask for"
-    return f"{count}: {met} of {len(asked)} zones get what they ask for"
+        return f"{count}: {every} zones meet their requirements"
+    return f"{count}: {met} of {len(asked)} zones meet their requirements"
 
 
 def warnings(result: dict[str, Any]) -> list[str]:
@@ -98,7 +98,9 @@ def typical(zones: list[dict[str, Any]]) -> str:
 def question(result: dict[str, Any]) -> list[str]:
     """Return the question, one line per part."""
     count = result["n_anchors"]
-    lines = [f"Where do {count} anchors go in {result['scene']!r}, and what do they promise?"]
+    lines = [
+        f"Where should {count} anchors go in {result['scene']!r}, and how accurate is the pose?"
+    ]
     for zone in zone_answers(result):
         if zone.asks:
             lines.append(f"{zone.name}: {zone.asks}")

@@ -30,9 +30,9 @@ def add_place(commands: Any) -> None:
     """Add the parser of ``rbl-gym place``."""
     place = commands.add_parser(
         "place",
-        help="where anchors go, and how good the pose will be",
-        description="Design a layout of anchors, predict the accuracy, compare with the usual "
-        "layouts, check with real filters. See docs/placement.md for the file format.",
+        help="design anchor positions and predict the accuracy of the pose",
+        description="Design a layout of anchors, predict its accuracy, compare it with the usual "
+        "layouts and check it with filters. See docs/placement.md for the file format.",
     )
     place.add_argument(
         "--scene",
@@ -44,7 +44,10 @@ def add_place(commands: Any) -> None:
         "--anchors",
         type=_numbers,
         metavar="N|A..B",
-        help="how many; A..B: accuracy against the number, or with --fewest what is allowed",
+        help=(
+            "number of anchors; A..B: accuracy for each number, or with --fewest the allowed "
+            "numbers"
+        ),
     )
     place.add_argument(
         "--fewest",
@@ -56,47 +59,53 @@ def add_place(commands: Any) -> None:
         type=int,
         choices=(0, 1),
         default=0,
-        help="1: any one anchor may fail, in judging and in the search",
+        help="1: the search and the results assume that any one anchor may fail; default 0",
     )
     place.add_argument(
-        "--layout", metavar="F", help="judge these anchors: a CSV file with x_m, y_m, z_m, name"
+        "--layout",
+        metavar="F",
+        help="evaluate the layout in a CSV file with columns x_m, y_m, z_m, name",
     )
     place.add_argument(
-        "--optimise", action="store_true", help="start from --layout; --anchors may ask for more"
+        "--optimise",
+        action="store_true",
+        help="optimise the layout of --layout; with more --anchors, add anchors to it",
     )
     place.add_argument(
         "--keep",
         metavar="NAMES",
-        help="anchors of --layout that stay, by their names or numbers, with commas; or all",
+        help=(
+            "anchors of --layout that stay in place: names or numbers, separated by commas; or all"
+        ),
     )
     place.add_argument(
         "--start",
         choices=("search", "amortised"),
         default="search",
-        help="amortised: the layout of a trained network and 20 steps at most, in place of the "
-        "search",
+        help="amortised: start from the layout of a trained network and take at most 20 steps, "
+        "instead of the search",
     )
     place.add_argument(
         "--racks",
         type=natural,
         default=0,
         metavar="K",
-        help="random boxes that block sight in a named room, default 0",
+        help="number of random boxes that block the line of sight in a named room, default 0",
     )
     place.add_argument(
         "--region",
         type=_region,
         metavar="x0,y0,z0,x1,y1,z1",
-        help="work region, metres; write --region=-1,... for a minus",
+        help="work region, metres; write --region=-1,... if the first number is negative",
     )
-    add_trials(place, 500, "of the check, ")
-    place.add_argument("--plot", metavar="F", help="picture: maps over the plan, layouts")
+    add_trials(place, 500, "number of trials of the check with filters")
+    place.add_argument("--plot", metavar="F", help="picture with maps over the plan, and layouts")
     add_html(place, "page with the plan, its maps, the tables and the scene in 3-D")
     add_report_options(place)
     add_json(place)
     add_plan_options(place)
     place.add_argument(
-        "--schema", action=_Schema, nargs=0, help="print the JSON schema of the file, and stop"
+        "--schema", action=_Schema, nargs=0, help="print the JSON schema of building files and exit"
     )
     place.set_defaults(run=_place)
 
@@ -167,11 +176,14 @@ def _layout(options: argparse.Namespace) -> Any:
                 raise ValueError(f"--{name} needs --layout")
         return None
     if options.fewest:
-        raise ValueError("--fewest looks for a layout: leave --layout out")
+        raise ValueError("--fewest searches for a layout: leave out --layout")
     if options.keep and not options.optimise:
-        raise ValueError("--keep needs --optimise: else all of the layout stays")
+        raise ValueError("--keep needs --optimise: otherwise the whole layout stays")
     if options.anchors is not None and not options.optimise:
-        raise ValueError("--anchors means nothing with --layout alone: its anchors are judged")
+        raise ValueError(
+            "--anchors with --layout needs --optimise: otherwise the anchors of the layout are "
+            "evaluated"
+        )
     from rbl_gym.placement.layout_files import read_layout
 
     return read_layout(options.layout)

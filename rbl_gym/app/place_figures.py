@@ -67,7 +67,7 @@ def building_figure(problem: Problem) -> Figure:
         axis.set_major_locator(MultipleLocator(step))
     axes.grid(color="0.6", lw=0.4, zorder=0.5)
     axes.plot(*problem.fixed[:, :2].T, "s", ms=7, color=place_draw.KEPT, mec="white", zorder=7)
-    axes.set_title(f"{problem.name}: the building as it was read, a line every {step:g} m")
+    axes.set_title(f"{problem.name}: the building as read, a grid line every {step:g} m")
     figure.supxlabel(legend_text(problem), fontsize=8, color="0.35")
     return figure
 
@@ -129,10 +129,10 @@ def legend_text(problem: Problem) -> str:
     """Return the legend of a plan."""
     parts = ["triangles: anchors, by number"]
     if len(problem.fixed):
-        parts.append("squares: anchors that stay")
+        parts.append("squares: fixed anchors")
     parts += ["dashed: zones", "violet: where anchors may stand"]
     if problem.obstacles:
-        parts.append("grey: obstacles, the darker the less of a link they leave")
+        parts.append("grey: obstacles, darker if they weaken links more")
     return "     ".join(parts)
 
 
@@ -176,8 +176,8 @@ def _draw_margins(axes: Any, result: dict[str, Any]) -> None:
     values = [margins[name] for name in names]
     _draw_bars(axes, names, values, texts, own, 1.45 * max(1.0, *values))
     axes.axvline(1.0, color="0.2", lw=1.2, ls=(0, (4, 2)))
-    axes.set_xlabel("margin: what is allowed over what is reached, in the worst zone; 1 is enough")
-    axes.set_title("this layout and the usual ones, against what the zones ask for")
+    axes.set_xlabel("margin: allowed over predicted error, in the worst zone; 1 or more is enough")
+    axes.set_title("margins of this layout and of the usual ones")
 
 
 def _own(rows: dict[str, dict[str, Any]]) -> str:

@@ -126,9 +126,9 @@ def _title_page(result: dict[str, Any]) -> Figure:
     page.text(
         _LEFT,
         0.06,
-        "Errors are one standard deviation of one reading of all ranges, the best that any "
-        "unbiased estimate can reach (Cramer-Rao).\nEvery estimate of a moving body that uses "
-        "more than one reading does better.",
+        "Errors are one standard deviation, from one reading of all ranges. No unbiased estimate "
+        "from one reading has smaller ones (Cramer-Rao bound).\nA filter that combines several "
+        "readings can have smaller errors.",
         fontsize=8,
         color="0.35",
         va="center",

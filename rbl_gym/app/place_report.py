@@ -60,10 +60,13 @@ def verdict(result: dict[str, Any]) -> str:
         how = "--optimise" if "given" in result["layouts"] else "--fewest"
         return f"{text} Try {how}, or more --anchors." if result["verdict"] == "fail" else text
     if not fewest["met"]:
-        return f"{text} No layout was found that meets them: allow more anchors, or ask less."
+        return (
+            f"{text} No layout was found that meets them: allow more anchors, or relax the "
+            "requirements."
+        )
     less = fewest["one_less"]
     if less is None:
-        return f"{text} That is the least number that was allowed."
+        return f"{text} This is the least number that was allowed."
     why = "no choice of" if fewest["proved"] else "no layout was found of"
     return f"{text} The least number: {why} {less['n_anchors']} that passes."
 
@@ -73,10 +76,11 @@ def notes(result: dict[str, Any]) -> list[str]:
     criteria, check = result["criteria"], result["check"]
     conditioning = criteria["conditioning"]
     found = [
-        "A place is within where one sigma of one epoch of ranges, root mean square over turns of "
-        "the body, is at most each limit: horizontal position, height, heading. The interval "
-        "(95 %) is of the drawn places; a zone passes where it lies above what is required. "
-        "Margin: limit over what is reached at the required share.",
+        "A place is within the requirement if one sigma of the pose from one epoch of ranges "
+        "(root mean square over rotations of the body) is at most each limit: horizontal "
+        "position, height, heading. The interval (95 %) is due to the sampling of places; a zone "
+        "passes if the whole interval is above the required share. Margin: limit over the error "
+        "at the required share.",
         "Predicted: Cramer-Rao bound of all three axes together; b is the root mean square tag "
         "error.",
         f"Criteria: position {criteria['position_m']:.4g} m, rotation "
@@ -85,16 +89,16 @@ def notes(result: dict[str, Any]) -> list[str]:
         + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
         f"Check: {check['trials']} bodies at random poses, as many in each zone; the EKF starts "
         f"from a prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m "
-        "around the truth. RMSE, ratio and NEES (6 where honest) are of all bodies that have a "
-        "pose; found: no further off than once in a million.",
+        "around the truth. RMSE, ratio and NEES (6 if consistent) are of all bodies that have a "
+        "pose; found: the error is not larger than expected once in a million.",
     ]
     for name, figures in check["filters"].items():
         if 1 - figures["found"] > _MANY_LOST:
             found.append(
-                f"{name}: {100 * (1 - figures['found']):.3g} % of the bodies are not found. Of the "
-                "others the position is off by "
+                f"{name}: {100 * (1 - figures['found']):.3g} % of the bodies are not found. For "
+                "the others the RMSE of the position is "
                 + _figure(figures.get("position_rmse_found_m"), 4)
-                + " m, as predicted times "
+                + " m, which is the predicted one times "
                 + _figure(figures.get("position_ratio_found"), 3)
                 + "."
             )
@@ -208,7 +212,7 @@ def _anchors(result: dict[str, Any]) -> Rows:
         ]
         for anchor in result["anchors"]
     ]
-    headings = ["anchor", "x (m)", "y (m)", "z (m)", "mount", "sees of zones"]
+    headings = ["anchor", "x (m)", "y (m)", "z (m)", "mount", "sees of the zones"]
     return Rows("anchors", headings, rows)
 
 
@@ -248,7 +252,10 @@ def _next(result: dict[str, Any]) -> Rows:
             ]
         )
     where = ", ".join(f"{more[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
-    title = f"one more would help most at ({where}), {more['mount']}: b times {more['ratio']:.3f}"
+    title = (
+        f"one more anchor would help most at ({where}), {more['mount']}: b changes by a "
+        f"factor of {more['ratio']:.3f}"
+    )
     headings = [
         "zone", "verdict", "within now", "then", "position RMS (m) now", "then",
         "heading RMS (deg) now", "then",

@@ -16,4 +16,4 @@ def survey_table(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]
         rows.append([row["known"], *(digits(row[key], n) for key, n in figures), *shares])
     headings = ["known", "position RMS (m)", "orientation RMS (deg)", "b (m)"]
     headings += [f"within {name}" for name in asking]
-    return "one epoch, by what is known of anchors and links", headings, rows
+    return "one epoch, by the knowledge of anchors and links", headings, rows

@@ -84,7 +84,7 @@ def plan_part(placed: Placed) -> str:
         f"{_labels(placed, edges)}</div>"
         f"{''.join(_scale(problem, q, ranges[q.field], maps) for q in panels)}"
         f'<p class="note">{html.escape(" · ".join(legend_text(problem).split("     ")))}</p>'
-        '<p class="readout">Touch the map or an anchor for its figures.</p>'
+        '<p class="readout">Touch the map or an anchor to see its values.</p>'
         f'<script type="application/json">{_data(placed, panels, maps, edges, middle)}</script>'
         "</figure>"
     )
@@ -319,7 +319,7 @@ def _data(
     """Return the data of the readout, as JSON."""
     problem = placed.problem
     names = {q.field: f"{q.name} # {q.unit}" for q in panels}
-    names["relative"] = "# of what is asked for"
+    names["relative"] = "# of the limit"
     rows = []
     for one in maps:
         row = []

@@ -14,14 +14,18 @@ def add_plan(commands: Any) -> None:
     """Add the parser of ``rbl-gym plan``."""
     plan = commands.add_parser(
         "plan",
-        help="a floor plan (DXF, GeoJSON, PNG) as a building file for place",
-        description="Write a building file (TOML, to be edited) of the layers of a drawing, or of "
-        "a picture. Without --out: show the layers. See docs/placement.md.",
+        help="convert a floor plan (DXF, GeoJSON, PNG) to a building file for place",
+        description="Write a building file (TOML, for you to edit) from the layers of a drawing, "
+        "or from a picture. Without --out: show the layers. See docs/placement.md.",
     )
-    plan.add_argument("plan", metavar="F", help=".dxf, .geojson, .png or .jpg; or a building file")
-    plan.add_argument("-o", "--out", metavar="F", help="the building file, .toml")
-    plan.add_argument("--anchors", type=positive, metavar="N", help="how many, default 8")
-    plan.add_argument("--plot", metavar="F", help="the building as it was read, with a metre grid")
+    plan.add_argument(
+        "plan", metavar="F", help="a .dxf, .geojson, .png or .jpg file, or a building file"
+    )
+    plan.add_argument("-o", "--out", metavar="F", help="name of the building file, .toml")
+    plan.add_argument("--anchors", type=positive, metavar="N", help="number of anchors, default 8")
+    plan.add_argument(
+        "--plot", metavar="F", help="picture of the building as read, with a grid in metres"
+    )
     add_plan_options(plan)
     add_json(plan)
     plan.set_defaults(run=_plan)
@@ -37,7 +41,7 @@ def _plan(options: argparse.Namespace) -> int:
         plan = read_plan(path, options, options.anchors)
         tables, said, layers = plan.tables, plan.said, plan_report.layer_rows(plan)
     elif options.out:
-        raise ValueError(f"{path}: --out is of a drawing or a picture, not of a building file")
+        raise ValueError(f"{path}: --out needs a drawing or a picture, got a building file")
     else:
         tables, said, layers = scene_files.load(path), [], []
         if options.picture:

@@ -17,12 +17,12 @@ _PICTURES = (".png", ".jpg", ".jpeg")
 _HELP = {
     "walls": "lines that weaken links: material=concrete, thickness_m=0.2, side_by_side_m=0.4 "
     "(drawn as two lines)",
-    "obstacles": "areas that weaken links, and where no body is: material, low_m, high_m",
+    "obstacles": "areas that weaken links and where the body cannot be: material, low_m, high_m",
     "zones": "where the body works: name, low_m, high_m, position_m=0.1, heading_deg, share",
     "mounts": "where anchors may stand: kind=wall, ceiling, column, area or points; low_m, high_m, "
     "height_m, side, cost",
-    "forbidden": "areas without anchors",
-    "fixed": "points of anchors that stay: height_m",
+    "forbidden": "areas where anchors may not stand",
+    "fixed": "points of fixed anchors: height_m",
 }
 
 
@@ -30,34 +30,48 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     """Add the options about a drawing or a picture."""
     plan = parser.add_argument_group(
         "floor plan",
-        "A drawing (.dxf, .geojson) or a picture (.png, .jpg). Each layer of a drawing is said to "
-        "be something, by LAYER,KEY=VALUE,...; * stands for any letters; an option can be given "
-        "several times. Without any, layers that are called so are taken so.",
+        "A drawing (.dxf, .geojson) or a picture (.png, .jpg). The options assign the layers of "
+        "a drawing, by LAYER,KEY=VALUE,...; * in LAYER matches any letters. Each option may be "
+        "given several times. Without options, layers named walls, zones, ... are assigned by "
+        "their names.",
     )
     for kind, text in _HELP.items():
         plan.add_argument(f"--{kind}", action="append", default=[], metavar="LAYER", help=text)
-    plan.add_argument("--units", metavar="U", help="of the drawing: mm, cm, m, km, in, ft, degrees")
+    plan.add_argument(
+        "--units", metavar="U", help="unit of the drawing: mm, cm, m, km, in, ft or degrees"
+    )
     plan.add_argument(
         "--zero",
         type=_pair,
         metavar="X,Y",
-        help="point of the drawing, in its units, that becomes (0, 0)",
+        help="point of the drawing, in its units, that becomes the origin (0, 0)",
     )
     plan.add_argument(
-        "--layer-property", metavar="P", help="GeoJSON: property that names the layer"
+        "--layer-property", metavar="P", help="GeoJSON property with the name of the layer"
     )
     plan.add_argument(
-        "--height", type=float, default=3.0, metavar="M", help="floor to ceiling, default 3 m"
+        "--height",
+        type=float,
+        default=3.0,
+        metavar="M",
+        help="height of the room, metres, default 3",
     )
-    plan.add_argument("--picture", metavar="F", help="picture behind the drawing or the file")
+    plan.add_argument(
+        "--picture", metavar="F", help="background picture of the drawing or the building file"
+    )
     plan.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the picture")
-    plan.add_argument("--width", type=float, metavar="M", help="width of the picture, instead")
+    plan.add_argument(
+        "--width",
+        type=float,
+        metavar="M",
+        help="width of the picture in metres, instead of --metres-per-pixel",
+    )
     plan.add_argument(
         "--origin",
         type=_pair,
         default=(0.0, 0.0),
         metavar="X,Y",
-        help="where the picture's lower left corner is, metres; default 0,0",
+        help="position of the lower left corner of the picture, metres; default 0,0",
     )
 
 
@@ -89,7 +103,7 @@ def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = No
     n_anchors = 8 if n_anchors is None else n_anchors
     if Path(path).suffix.lower() in _PICTURES:
         if told:
-            raise ValueError(f"{path}: a picture has no layers: --{told[0].kind} means nothing")
+            raise ValueError(f"{path}: a picture has no layers: leave out --{told[0].kind}")
         shown = pictures.backdrop(path, scale(path, options), options.origin)
         made = pictures.of_picture(shown, options.height, n_anchors)
         return Plan(made.tables, made.said, made.used, None)
@@ -109,7 +123,7 @@ def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
     if not is_plan(path):
         told = [kind for kind in _HELP if getattr(options, kind)]
         if told:
-            raise ValueError(f"--{told[0]} is of a drawing, .dxf or .geojson, got {path}")
+            raise ValueError(f"--{told[0]} needs a drawing, .dxf or .geojson, got {path}")
         problem = scene_files.problem(path, n_anchors, options.region, options.racks, options.seed)
         if options.picture:
             plan = problem.plan or building.Plan()
@@ -132,15 +146,15 @@ def add_report_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report",
         metavar="F",
-        help="PDF: question and answer, plan, maps, mounting list, tables",
+        help="PDF report with the answer, plan, maps, mounting list and tables",
     )
     parser.add_argument(
         "--export",
         action="append",
         default=[],
         metavar="F",
-        help="the layout: .csv (mounting list), .geojson, or .dxf (in a copy of the drawing); "
-        "may be given several times",
+        help="file of the layout: .csv (mounting list), .geojson, or .dxf (a copy of the drawing "
+        "with the anchors); may be given several times",
     )
 
 
@@ -183,7 +197,7 @@ def scale(path: str, options: argparse.Namespace) -> float:
     from rbl_gym.placement.plans import pictures
 
     if (options.metres_per_pixel is None) == (options.width is None):
-        raise ValueError(f"{path}: a picture needs --metres-per-pixel or --width, one of them")
+        raise ValueError(f"{path}: a picture needs either --metres-per-pixel or --width")
     if options.metres_per_pixel is not None:
         return options.metres_per_pixel
     return options.width / pictures.pixels(path)[0]

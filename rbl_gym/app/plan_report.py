@@ -35,7 +35,7 @@ def print_plan(layers: list[dict[str, Any]], said: list[str]) -> None:
     console = new_console()
     if layers:
         table = new_table("layers of the drawing")
-        for heading in ("layer", "taken for", "entities", "not read"):
+        for heading in ("layer", "read as", "entities", "not read"):
             table.add_column(heading)
         for row in layers:
             table.add_row(
@@ -69,8 +69,8 @@ def write_building(tables: dict[str, Any], source: str, said: list[str], path: s
         for key, value in tables["plan"].items()
     }
     head = [
-        f"Read from {Path(source).name} by rbl-gym plan. Lengths are metres. Go on by editing, and",
-        f"look at it by: rbl-gym plan {Path(path).name} --plot plan.png",
+        f"Read from {Path(source).name} by rbl-gym plan. Lengths are in metres. Edit this file.",
+        f"Draw it with: rbl-gym plan {Path(path).name} --plot plan.png",
         *said,
     ]
     Path(path).write_text(to_toml({**tables, "plan": plan}, head), encoding="utf-8")

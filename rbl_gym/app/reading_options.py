@@ -34,18 +34,32 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
     for name, text in (
         (
             "ranges",
-            "t,anchor,tag,range[,std,valid,run], or t,a0t0,a0t1,..., or differences "
+            "CSV: t,anchor,tag,range[,std,valid,run], or t,a0t0,a0t1,..., or time differences "
             "t,anchor_a,anchor_b,tag,difference",
         ),
-        ("anchors", "anchor,x,y,z; anchor,t,x,y,z where they move; without it ax,ay,az in ranges"),
-        ("tags", "tag,x,y,z; without it one tag at the body's origin"),
-        ("truth", "TUM, EuRoC/ASL, t,x,y,z,qw,qx,qy,qz, or t,x,y[,z][,yaw_deg]"),
-        ("calibration", "anchor,tag,bias_m[,slope]"),
-        ("directions", "end,id,harmonic,bias_cos_m,bias_sin_m: bias by the direction of the ray"),
-        ("carrier", "poses, as of the truth, of a body that carries the anchors"),
-        ("odometry", "t,vx[,vy,vz][,wx,wy],wz in the body frame, or t,left,right of wheels"),
-        ("imu", "t,wx,wy,wz,ax,ay,az, rad/s and m/s^2"),
-        ("imu-frame", "its axes in the body's: rotation vector in degrees, or a file qw,qx,qy,qz"),
+        (
+            "anchors",
+            "CSV: anchor,x,y,z, or anchor,t,x,y,z if they move; without it columns ax,ay,az in "
+            "--ranges",
+        ),
+        ("tags", "CSV: tag,x,y,z in the body frame; without it one tag at the body's origin"),
+        ("truth", "true poses: TUM, EuRoC/ASL, or CSV: t,x,y,z,qw,qx,qy,qz or t,x,y[,z][,yaw_deg]"),
+        ("calibration", "biases of the links, CSV: anchor,tag,bias_m[,slope]"),
+        (
+            "directions",
+            "biases by the direction of the ray, CSV: end,id,harmonic,bias_cos_m,bias_sin_m",
+        ),
+        ("carrier", "poses of a body that carries the anchors, in a format of --truth"),
+        (
+            "odometry",
+            "CSV: t,vx[,vy,vz][,wx,wy],wz in the body frame, or wheel speeds t,left,right",
+        ),
+        ("imu", "inertial sensor, CSV: t,wx,wy,wz,ax,ay,az in rad/s and m/s^2"),
+        (
+            "imu-frame",
+            "rotation from the axes of --imu to those of the body: a rotation vector in degrees, "
+            "or a file with qw,qx,qy,qz",
+        ),
     ):
         if name not in left_out:
             required = name == "ranges" and not left_out
@@ -56,49 +70,60 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
         type=_pairs,
         action="append",
         metavar="WHAT=NAME,...",
-        help="what columns are called: time=time_s,anchor=to_id,range=dist; of another file "
-        "truth.x=px, anchors.anchor=name; wide: range=r_{anchor}_{tag},std=sd_{anchor}_{tag}; "
-        "all that begin so: truth.*=B_*; without a header by number, odometry.t=1; may be given "
-        "more than once",
+        help="names of the columns: time=time_s,anchor=to_id,range=dist; in another file "
+        "truth.x=px, anchors.anchor=name; one column for each link "
+        "range=r_{anchor}_{tag},std=sd_{anchor}_{tag}; with a prefix truth.*=B_*; numbers if "
+        "there is no header, odometry.t=1; may be given several times",
     )
     reading.add_argument(
         "--where",
         type=_pairs,
         action="append",
         metavar="COLUMN=CELL,...",
-        help="rows that are meant: anchors.agent=1,tags.agent=2",
+        help="rows to read: anchors.agent=1,tags.agent=2",
     )
     reading.add_argument(
         "--time-unit",
         metavar="UNIT",
-        help="of the ranges: s, ms, us, ns or iso; default as the header tells, else found",
+        help=(
+            "unit of the times of --ranges: s, ms, us, ns or iso; default: from the header, "
+            "else detected"
+        ),
     )
-    reading.add_argument("--unit", metavar="UNIT", help="of the ranges: m, cm or mm; default m")
+    reading.add_argument("--unit", metavar="UNIT", help="unit of --ranges: m, cm or mm; default m")
     reading.add_argument(
         "--offset",
         choices=OFFSETS,
-        help="whose ranges have an unknown offset in common (pseudo-ranges): each tag's, each "
-        "anchor's, or all of an epoch; they may be zero and negative",
+        help="ranges are pseudo-ranges with an unknown offset common to each tag, to each anchor "
+        "or to the whole epoch; they may be zero or negative",
     )
     reading.add_argument(
         "--wheelbase-m",
         type=float,
         metavar="X",
-        help="distance between the wheels of --odometry with left and right, unless it has width",
+        help=(
+            "distance between the wheels, metres, for --odometry with columns left and right "
+            "but without width"
+        ),
     )
     reading.add_argument(
-        "--turn-unit", metavar="UNIT", default="rad/s", help="of turn rates: rad/s or deg/s"
+        "--turn-unit", metavar="UNIT", default="rad/s", help="unit of turn rates: rad/s or deg/s"
     )
-    reading.add_argument("--run", dest="which_run", metavar="NAME", help="one of several runs")
+    reading.add_argument(
+        "--run",
+        dest="which_run",
+        metavar="NAME",
+        help="name of the run to read, if there are several",
+    )
     reading.add_argument(
         "--relative",
         action="store_true",
-        help="with --carrier: the pose in the carrier's frame, not in the world",
+        help="with --carrier: estimate the pose in the frame of the carrier, not of the world",
     )
     reading.add_argument(
         "--strict",
         action="store_true",
-        help="refuse, by line, what is dropped, sorted or counted otherwise",
+        help="stop with an error at data that are otherwise dropped or sorted",
     )
 
 

@@ -37,16 +37,16 @@ def add_replay(commands: Any) -> None:
     """
     replay = commands.add_parser(
         "replay",
-        help="a recording of ranges through a filter",
-        description="Track a recorded body; with --truth, the errors.",
+        help="run a filter on a recording of ranges",
+        description="Track a body with the ranges of a recording. With --truth, report the errors.",
     )
     add_reading(replay)
-    _add_knowledge(replay.add_argument_group("what is known of the body's place"))
+    _add_knowledge(replay.add_argument_group("knowledge of the body's position"))
     _add_filter(replay.add_argument_group("filter"))
-    _add_motion(replay.add_argument_group("how the body moves"))
+    _add_motion(replay.add_argument_group("motion of the body"))
     add_odometry(replay.add_argument_group("odometry"))
     add_inertial(replay.add_argument_group("inertial sensor (filter iekf-imu)"))
-    _add_tuning(replay.add_argument_group("settings by the likelihood of the log"))
+    _add_tuning(replay.add_argument_group("tuning by the likelihood of the log"))
     _add_biases(replay.add_argument_group("biases of the links"))
     _add_smoothing(replay.add_argument_group("the smoothed track"))
     _add_comparison(replay.add_argument_group("comparison with the truth"))
@@ -56,20 +56,24 @@ def add_replay(commands: Any) -> None:
 
 def _add_knowledge(group: Any) -> None:
     group.add_argument(
-        "--planar", action="store_true", default=None, help="hold height, roll and pitch"
+        "--planar",
+        action="store_true",
+        default=None,
+        help="the body moves in a plane: height, roll and pitch are held",
     )
     _add_number(
         group,
         "--height-offset-m",
-        "of the tags' mean height below the anchors', with --planar; default 0 where the "
-        "anchors stand at one height",
+        "with --planar: depth of the tags below the anchors (difference of the mean heights), "
+        "metres; default 0 if all anchors have the same height",
     )
     group.add_argument(
         "--volume",
         type=_volume,
         metavar="xmin,xmax,ymin,ymax,zmin,zmax",
-        help="where the body's origin may be, metres: tells a pose from its mirror image; empty "
-        "where there is no limit, as in --volume=,,,,,1.8; write --volume=-1,... for a minus",
+        help="where the body's origin may be, metres; separates a pose from its mirror image. "
+        "Leave a number empty for no limit, as in --volume=,,,,,1.8; write --volume=-1,... "
+        "if the first number is negative",
     )
     group.add_argument(
         "--below-anchors",
@@ -81,24 +85,44 @@ def _add_knowledge(group: Any) -> None:
         "--start",
         type=_start,
         metavar="x,y,z[,yaw_deg]",
-        help="where the body's origin is at first, metres, and its heading; write --start=-1,... "
-        "for a minus",
+        help="first position of the body's origin, metres, and its heading; write --start=-1,... "
+        "if the first number is negative",
     )
-    _add_number(group, "--prior-position-m", "standard deviation of the start, default 0.5")
     _add_number(
-        group, "--prior-rotation-deg", "of its rotation, default 30 with a yaw, else unknown"
+        group, "--prior-position-m", "standard deviation of the first position, metres, default 0.5"
     )
-    _add_number(group, "--height-m", "the body's origin stays at about this height (or --planar)")
-    _add_number(group, "--height-std-m", "standard deviation of that")
-    _add_number(group, "--tilt-std-deg", "the body stays level but for this, about each axis")
+    _add_number(
+        group,
+        "--prior-rotation-deg",
+        "standard deviation of the first rotation, degrees; default 30 with a yaw in "
+        "--start, else unknown",
+    )
+    _add_number(
+        group,
+        "--height-m",
+        "height of the body's origin, metres; held exactly with --planar, else within "
+        "--height-std-m",
+    )
+    _add_number(group, "--height-std-m", "standard deviation of --height-m, metres")
+    _add_number(
+        group,
+        "--tilt-std-deg",
+        "the body stays level: standard deviation of roll and pitch, degrees",
+    )
 
 
 def _add_filter(group: Any) -> None:
     group.add_argument(
         "--filter",
         metavar="NAME",
-        help=f"{FILTER_HELP}; default iekf-log, with --walk-... iekf, with --raw or --bias-... "
-        "iekf-bias, with --imu iekf-imu; robust is late of iekf-log and iekf-imu, else true",
+        help=f"{FILTER_HELP}; default iekf-log, but iekf with --walk-..., iekf-bias with --raw or "
+        "--bias-..., iekf-imu with --imu; default of robust: late for iekf-log and iekf-imu, "
+        "else true",
+    )
+    _add_number(
+        group,
+        "--range-std-m",
+        "standard deviation of a range, metres; default: that of the recording, else 0.12",
     )
     # Of 0.1: --filter NAME/robust=false.
     group.add_argument(
@@ -108,17 +132,27 @@ def _add_filter(group: Any) -> None:
 
 
 def _add_motion(group: Any) -> None:
-    _add_number(group, "--walk-m", "random walk of the position after 1 s, default 0.1")
-    _add_number(group, "--walk-deg", "random walk of the rotation after 1 s, default 7")
+    _add_number(
+        group,
+        "--walk-m",
+        "random walk of the position: standard deviation after 1 s, metres, default 0.1",
+    )
+    _add_number(
+        group,
+        "--walk-deg",
+        "random walk of the rotation: standard deviation after 1 s, degrees, default 7",
+    )
     _add_number(
         group,
         "--accel-m",
-        "iekf-log, iekf-cv: change of the speed (m/s) after 1 s, default 1 and 0.5",
+        "iekf-log, iekf-cv: standard deviation of the change of speed after 1 s, m/s; default 1 "
+        "and 0.5",
     )
     _add_number(
         group,
         "--accel-deg",
-        "iekf-log, iekf-cv: of the turn rate (deg/s) after 1 s, default 30",
+        "iekf-log, iekf-cv: standard deviation of the change of turn rate after 1 s, deg/s; "
+        "default 30",
     )
 
 
@@ -126,28 +160,49 @@ def _add_tuning(group: Any) -> None:
     group.add_argument(
         "--tune",
         action="store_true",
-        help="choose --range-std-m and the motion (--walk-..., of an estimated twist --accel-...) "
-        "by the likelihood of the log's first part; the truth is not looked at; where no "
-        "--filter is given it is chosen too, with a --calibration iekf-bias",
+        help="choose --range-std-m and the motion (--walk-..., or --accel-... if the twist is "
+        "estimated) by the likelihood of the first part of the log; without --filter also "
+        "the filter, or iekf-bias with --calibration. The truth is not used",
     )
-    _add_number(group, "--tune-s", "length of that part, default 20; tunes as --tune does")
+    _add_number(group, "--tune-s", "length of this first part, seconds, default 20; implies --tune")
 
 
 def _add_biases(group: Any) -> None:
     for name, text in (
-        ("constant-std-m", "iekf-log: of a link's bias that stays, default 0.05"),
-        ("constant-common-m", "iekf-log: of what all links have in common, default 0.1"),
-        ("drift-std-m", "iekf-log: of a link's bias that moves, default 0.05"),
-        ("drift-time-s", "iekf-log: how long that lasts, default 3"),
-        ("bias-std-m", "iekf-bias: of a link's bias, default 0.02, with --raw 0.05"),
-        ("bias-time-s", "iekf-bias: how long it lasts, default 3, with --raw for ever"),
-        ("bias-common-m", "iekf-bias: of what all have in common, default 0, with --raw 0.1"),
+        (
+            "constant-std-m",
+            "iekf-log: standard deviation of the constant bias of a link, metres, default 0.05",
+        ),
+        (
+            "constant-common-m",
+            "iekf-log: standard deviation of the constant bias common to all links, metres, "
+            "default 0.1",
+        ),
+        (
+            "drift-std-m",
+            "iekf-log: standard deviation of the drifting bias of a link, metres, default 0.05",
+        ),
+        ("drift-time-s", "iekf-log: correlation time of the drifting bias, seconds, default 3"),
+        (
+            "bias-std-m",
+            "iekf-bias: standard deviation of the bias of a link, metres, default 0.02, with "
+            "--raw 0.05",
+        ),
+        (
+            "bias-time-s",
+            "iekf-bias: correlation time of this bias, seconds, default 3, with --raw constant",
+        ),
+        (
+            "bias-common-m",
+            "iekf-bias: standard deviation of the bias common to all links, metres, default 0, "
+            "with --raw 0.1",
+        ),
     ):
         _add_number(group, f"--{name}", text)
     group.add_argument(
         "--raw",
         action="store_true",
-        help="ranges of radios that nobody calibrated: iekf-bias learns the biases that stay",
+        help="the radios are not calibrated: iekf-bias estimates constant biases",
     )
 
 
@@ -156,32 +211,58 @@ def _add_smoothing(group: Any) -> None:
         "--smooth",
         action="store_true",
         default=None,
-        help="the most likely track of the whole log beside the causal one",
+        help="compute the most likely track from the whole log, in addition to the causal one",
     )
-    _add_number(group, "--smooth-accel-m", "change of the speed (m/s) after 1 s, default 0.2")
-    _add_number(group, "--smooth-accel-deg", "of the turn rate (deg/s) after 1 s, default 15")
-    _add_number(group, "--smooth-bias-std-m", "of a link's bias that drifts, default 0.06")
-    _add_number(group, "--smooth-bias-time-s", "how long that lasts, default 3")
-    _add_number(group, "--smooth-constant-m", "of a link's bias that stays, default 0.1")
-    _add_number(group, "--smooth-common-m", "of what those have in common, default 0.2")
+    _add_number(
+        group,
+        "--smooth-accel-m",
+        "standard deviation of the change of speed after 1 s, m/s, default 0.2",
+    )
+    _add_number(
+        group,
+        "--smooth-accel-deg",
+        "standard deviation of the change of turn rate after 1 s, deg/s, default 15",
+    )
+    _add_number(
+        group,
+        "--smooth-bias-std-m",
+        "standard deviation of the drifting bias of a link, metres, default 0.06",
+    )
+    _add_number(
+        group, "--smooth-bias-time-s", "correlation time of the drifting bias, seconds, default 3"
+    )
+    _add_number(
+        group,
+        "--smooth-constant-m",
+        "standard deviation of the constant bias of a link, metres, default 0.1",
+    )
+    _add_number(
+        group,
+        "--smooth-common-m",
+        "standard deviation of the constant bias common to all links, metres, default 0.2",
+    )
 
 
 def _add_comparison(group: Any) -> None:
     _add_number(group, "--yaw-offset-deg", "yaw error = estimate - (truth + offset)")
-    _add_number(group, "--truth-gap-s", "longest gap bridged between truth and ranges, default 0.5")
+    _add_number(
+        group,
+        "--truth-gap-s",
+        "longest gap of truth or ranges that is interpolated, seconds, default 0.5",
+    )
     group.add_argument(
         "--truth-exclude",
         type=window,
         action="append",
         metavar="START:END",
-        help="seconds (of the ranges' clock) in which the truth is wrong: not judged; may be "
-        "given more than once",
+        help="interval with wrong truth, seconds by the clock of the ranges, left out of the "
+        "errors; may be given several times",
     )
     add_clocks(group)
     group.add_argument(
         "--align",
         choices=("none", "position", "yaw", "se3"),
-        help="estimate the truth's world frame from the matched positions, as evo does; default "
+        help="align the world frame of the truth to the estimated positions, as evo does; default "
         "none",
     )
 
@@ -190,11 +271,11 @@ def _add_output(group: Any) -> None:
     group.add_argument(
         "--track",
         metavar="F",
-        help="the track, with --smooth the smoothed one: TUM where F ends in .tum or .txt, else "
+        help="file of the track, with --smooth of the smoothed one: .tum or .txt (TUM format), or "
         ".csv with covariance, NIS and rank",
     )
     group.add_argument("--plot", metavar="F", help="picture of the track and the errors")
-    add_html(group, "3-D page of the track with charts and tables")
+    add_html(group, "page with the track in 3-D, charts and tables")
     add_json(group)
 
 
@@ -270,7 +351,7 @@ def _replay_runs(
 
     if options.plot or options.html or options.track:
         raise ValueError(
-            f"--plot, --html and --track are of one run, and {options.ranges} has {len(runs)}, "
+            f"--plot, --html and --track need a single run, but {options.ranges} has {len(runs)}, "
             f"{[*runs]!r:.200}: choose one by --run"
         )
     with progress("replay", sum(len(run.times) for run in runs.values())) as advance:
@@ -297,18 +378,16 @@ def _settings(options: argparse.Namespace) -> Any:
     biases = {name: value for name, value in given.items() if name in _RAW}
     if options.raw:
         if options.calibration:
-            raise ValueError("--raw means ranges without --calibration")
+            raise ValueError("--raw must be left out with --calibration")
         biases = {**_RAW, **biases}
     filter = options.filter or ("iekf-imu" if options.imu else _filter_for(given, biases))
     name, _ = estimators.parse_filter(filter)
     if biases and name != "iekf-bias":
-        raise ValueError(
-            f"{name} knows no biases of that law: --raw and --bias-... are of iekf-bias"
-        )
+        raise ValueError(f"--raw and --bias-... need the filter iekf-bias, got {name}")
     of_log = [key for key in given if key.startswith(("constant_", "drift_"))]
     if of_log and name not in ("iekf-log", "iekf-imu"):
         option = of_log[0].replace("_", "-")
-        raise ValueError(f"--{option} is of iekf-log, not of {name}")
+        raise ValueError(f"--{option} needs the filter iekf-log, got {name}")
     return replay.Settings.of(**{**given, **biases, "filter": filter})
 
 

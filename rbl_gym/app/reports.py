@@ -55,10 +55,10 @@ def print_camsap2013(result: dict[str, Any]) -> None:
         )
     deviation = 100 / (6 * result["trials"]) ** 0.5
     console.print(
-        f"Assumed, for it is not printed: {', '.join(result['assumed'])}.\n"
-        "Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward = -log b.\n"
-        "KF and ET-KF are judged by their raw matrix, as in the paper. One standard deviation of\n"
-        f"an RMSE is about {deviation:.1f} %: with few trials a claim can fail by chance."
+        f"Assumed, as the paper does not print it: {', '.join(result['assumed'])}.\nRatios are to "
+        "the posterior Cramer-Rao bound, averaged over the steps; reward = -log b.\nKF and ET-KF "
+        "are scored by their raw matrix, as in the paper. One standard deviation of\nan RMSE is "
+        f"about {deviation:.1f} %: with few trials a claim can fail by chance."
     )
 
 
@@ -112,7 +112,7 @@ def print_replay(result: dict[str, Any]) -> None:
             f"{fit['nis']:.2f}"
         )
     if "epochs_with_truth" not in result:
-        console.print("no truth, no errors")
+        console.print("no truth, so no errors")
         print_consistency(console, result)
         _print_notes(console, result)
         return
@@ -143,7 +143,8 @@ def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -
     console.print(table)
     mean = f"mean yaw error {result['yaw_mean_deg']:.2f} deg, " if "yaw_mean_deg" in result else ""
     console.print(
-        f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: honest; above: overconfident)"
+        f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: consistent; above: "
+        "overconfident)"
     )
 
 
@@ -174,7 +175,7 @@ def print_runs(result: dict[str, Any]) -> None:
     common = [note for note in notes[0] if all(note in others for others in notes)]
     _print_notes(console, {"notes": common})
     if own := sum(len(others) > len(common) for others in notes):
-        console.print(f"{own} of {len(notes)} runs have notes of their own: see --run or --json")
+        console.print(f"{own} of {len(notes)} runs have other notes: see --run or --json")
 
 
 def compared(result: dict[str, Any]) -> list[str]:
@@ -184,15 +185,16 @@ def compared(result: dict[str, Any]) -> list[str]:
         f"({result['truth_format']})"
     ]
     if "epochs_excluded" in result:
-        parts.append(f"{result['epochs_excluded']} more are left out (truth_exclude)")
+        parts.append(f"{result['epochs_excluded']} epochs more are excluded (truth_exclude)")
     for what in ("odometry", "imu"):
         if (found := result.get(f"{what}_clock")) is None:
             continue
         how = f"the likelihood of the ranges (higher by {found['gain']:.1f})"
         if found["correlation"] is not None:
             how = (
-                f"accelerations of the ranges' track (correlation {found['correlation']:.2f}; "
-                f"log-likelihood higher by {found['gain']:.1f} than at any other offset)"
+                "accelerations of the track of the ranges (correlation "
+                f"{found['correlation']:.2f}; log-likelihood higher by {found['gain']:.1f} than "
+                "at any other offset)"
             )
         parts.append(
             f"the clock of --{what} is ahead by {found['offset_s']:.3f} s "
@@ -232,7 +234,7 @@ def print_training(result: dict[str, Any]) -> None:
             f"{point['steps']:>10,} steps  {', '.join(told)}{' while exploring' * explores}"
         )
     share = result["env_share"] if explores else 0.0
-    of_it = f"; the environment took {100 * share:.0f} % of the processor's time" * explores
+    of_it = f"; the environment took {100 * share:.0f} % of the CPU time" * explores
     console.print(
         f"{result['steps']:,} steps in {result['seconds']:.0f} s{of_it}\npolicy: {result['policy']}"
     )

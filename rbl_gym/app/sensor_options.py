@@ -19,30 +19,43 @@ _CLOCKS = {"truth": "time_offset", "odometry": "odometry_offset_s", "imu": "imu_
 def add_odometry(group: Any) -> None:
     """Add the options of `rbl_gym.studies.replay.Odometry`."""
     for name, text in (
-        ("odometry-m", "by how much its way is off after 1 s, default 0.05"),
-        ("slip-m", "the same sideways and vertically, default 0.03"),
-        ("odometry-deg", "of its turns, default 6"),
-        ("odometry-scale", "of its scale errors, default 0.03"),
-        ("odometry-bias-deg-s", "of the biases of its turn rates, default 0.5"),
+        (
+            "odometry-m",
+            "standard deviation of the forward distance after 1 s, metres, default 0.05",
+        ),
+        ("slip-m", "the same sideways and vertically, metres, default 0.03"),
+        ("odometry-deg", "standard deviation of the turn after 1 s, degrees, default 6"),
+        ("odometry-scale", "standard deviation of the scale errors, default 0.03"),
+        (
+            "odometry-bias-deg-s",
+            "standard deviation of the biases of the turn rates, deg/s, default 0.5",
+        ),
     ):
         group.add_argument(f"--{name}", type=float, metavar="X", help=text)
     group.add_argument(
         "--headings",
         type=int,
         metavar="N",
-        help="headings to start from where --start tells none, default 12",
+        help="number of headings to start from if --start has none, default 12",
     )
 
 
 def add_inertial(group: Any) -> None:
     """Add the options of `rbl_gym.studies.replay.Inertial`."""
     for name, text in (
-        ("gyro-noise", "density of its white noise, rad/s/sqrt(Hz), default 0.003"),
+        (
+            "gyro-noise",
+            "density of the white noise of the gyroscope, rad/s/sqrt(Hz), default 0.003",
+        ),
         ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.05"),
-        ("gravity-tilt-deg", "of the world's z axis against the vertical, default 1"),
+        (
+            "gravity-tilt-deg",
+            "standard deviation of the tilt of the world's z axis against the vertical, degrees, "
+            "default 1",
+        ),
         (
             "recorded-share",
-            "of the log's own deviations, what is noise, default 0.5",
+            "share of the standard deviations in the log that is noise, default 0.5",
         ),
     ):
         group.add_argument(f"--{name}", type=float, metavar="X", help=text)
@@ -56,10 +69,10 @@ def add_clocks(group: Any) -> None:
         action="append",
         dest="time_offsets",
         metavar="[WHAT=]S",
-        help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
-        "the motion; odometry=S and imu=S of those; odometry=auto by the likelihood of the "
-        "ranges, to 2.4 s; imu=auto by accelerations of their track, to 10 s; may be given more "
-        "than once",
+        help="how far the clock of the truth is ahead of the clock of the ranges, seconds; auto: "
+        "estimated from the motion. odometry=S and imu=S: the same for these clocks; "
+        "odometry=auto: estimated by the likelihood of the ranges, up to 2.4 s; imu=auto: "
+        "estimated from accelerations, up to 10 s. May be given several times",
     )
 
 
@@ -74,7 +87,7 @@ def told_clocks(options: argparse.Namespace) -> dict[str, Any]:
     told = dict(options.time_offsets or ())
     for what in told:
         if what != "truth" and getattr(options, what) is None:
-            raise ValueError(f"--time-offset {what}=... means nothing without --{what}")
+            raise ValueError(f"--time-offset {what}=... needs --{what}")
     return {
         _CLOCKS[what]: value for what, value in told.items() if what == "truth" or value != "auto"
     }
@@ -103,6 +116,6 @@ def _clock(text: str) -> tuple[str, float | str]:
     what = what if equal else "truth"
     if what not in _CLOCKS:
         raise argparse.ArgumentTypeError(
-            f"must be of one of {', '.join(_CLOCKS)}, as in odometry=0.1, got {text!r}"
+            f"must name one of {', '.join(_CLOCKS)}, as in odometry=0.1, got {text!r}"
         )
     return what, offset(value)

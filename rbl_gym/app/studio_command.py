@@ -16,10 +16,11 @@ def add_studio(commands: Any) -> None:
     """Add the parser of ``rbl-gym studio``."""
     studio = commands.add_parser(
         "studio",
-        help="take anchors by the hand, watch filters at work: a page in the browser",
-        description="Open a page on which anchors are dragged while a map of the accuracy follows; "
-        "with --watch, --env or --ranges one on which filters are at work. "
-        "Whoever can open the page can change the layout and save into the folder.",
+        help="drag anchors or watch filters on a page in the browser",
+        description="Open a page in the browser. On it you drag anchors, and a map of the accuracy "
+        "follows. With --watch, --env or --ranges the page shows filters that track a body. "
+        "Everybody who can open the page can change the layout and save files into the "
+        "folder.",
     )
     studio.add_argument(
         "scene",
@@ -31,43 +32,56 @@ def add_studio(commands: Any) -> None:
         "--anchors",
         type=_count_or_file,
         metavar="N|F",
-        help="how many, to begin with; with --ranges the file anchor,x,y,z",
+        help="number of anchors at the start; with --ranges the CSV file anchor,x,y,z",
     )
-    studio.add_argument("--layout", metavar="F", help="anchors to begin with: a CSV file")
+    studio.add_argument("--layout", metavar="F", help="CSV file of the layout at the start")
     studio.add_argument(
         "--host",
         default="127.0.0.1",
         metavar="H",
-        help="address to listen on, default 127.0.0.1: this machine alone",
+        help="address to listen on, default 127.0.0.1: only this machine",
     )
     studio.add_argument(
-        "--port", type=natural, default=8080, help="the first that is tried, default 8080; 0: any"
+        "--port",
+        type=natural,
+        default=8080,
+        help="first port that is tried, default 8080; 0: any free port",
     )
     studio.add_argument(
-        "--folder", default=".", metavar="D", help="where files are saved, default the working one"
+        "--folder",
+        default=".",
+        metavar="D",
+        help="folder in which files are saved, default the working directory",
     )
-    add_seed(studio, "of all searches, and of what is watched")
-    studio.add_argument("--no-browser", action="store_true", help="print the address alone")
-    watch = studio.add_argument_group("filters at work")
-    watch.add_argument("--watch", action="store_true", help="an episode of SCENE|FILE")
+    add_seed(studio, "seed of the searches and of the episodes")
+    studio.add_argument(
+        "--no-browser", action="store_true", help="print the address and open no browser"
+    )
+    watch = studio.add_argument_group("watching filters")
+    watch.add_argument("--watch", action="store_true", help="show an episode of SCENE|FILE")
     watch.add_argument(
-        "--env", metavar="ID", help="an episode of an environment, as RBL/AnchorSelection-v0"
+        "--env", metavar="ID", help="show an episode of an environment, as RBL/AnchorSelection-v0"
     )
     watch.add_argument(
         "--policy",
         metavar="F",
-        help="a policy of rbl-gym train in a held-out world of its task, or in an episode of --env",
+        help=(
+            "show a policy of rbl-gym train in a held-out world of its task, or in an "
+            "episode of --env"
+        ),
     )
     watch.add_argument(
-        "--reference", metavar="NAME", help="beside the policy; default the strongest"
+        "--reference",
+        metavar="NAME",
+        help="reference to show beside the policy; default the strongest",
     )
     watch.add_argument(
         "--filter",
         type=names,
         default=[],
         metavar="A,B",
-        help=f"one or several side by side: {FILTER_HELP}; default iekf,iekf/robust=true, of a "
-        "recording iekf-log",
+        help=f"one or several filters, shown side by side: {FILTER_HELP}; default "
+        "iekf,iekf/robust=true, for a recording iekf-log",
     )
     add_plan_options(studio)
     add_reading(studio, left_out=("anchors",))
@@ -114,7 +128,7 @@ def _studio(options: argparse.Namespace) -> int:
 
 def _check_scene(options: argparse.Namespace) -> None:
     if options.scene is None:
-        raise ValueError("SCENE|FILE is missing: a named scene as uwb_room, or a building file")
+        raise ValueError("SCENE|FILE must be given: a named scene as uwb_room, or a building file")
     if isinstance(options.anchors, str):
         raise ValueError(f"--anchors must be a number without --ranges, got {options.anchors!r}")
 

@@ -28,24 +28,28 @@ def add_json(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="-",
         metavar="F",
-        help="write the figures as JSON to F; without F, to standard output in place of the table",
+        help="write the results as JSON to F; without F, to standard output instead of the table",
     )
 
 
-def add_seed(parser: argparse.ArgumentParser, of: str = "of all randomness") -> None:
+def add_seed(parser: argparse.ArgumentParser, of: str = "seed of all random numbers") -> None:
     """Add the option --seed."""
     parser.add_argument("--seed", type=natural, default=0, help=f"{of}, default 0")
 
 
-def add_trials(parser: argparse.ArgumentParser, default: int = 1000, of: str = "") -> None:
+def add_trials(
+    parser: argparse.ArgumentParser, default: int = 1000, what: str = "number of trials"
+) -> None:
     """Add the options --trials and --seed."""
-    parser.add_argument("--trials", type=positive, default=default, help=f"{of}default {default}")
+    parser.add_argument(
+        "--trials", type=positive, default=default, help=f"{what}, default {default}"
+    )
     add_seed(parser)
 
 
 def add_html(parser: argparse.ArgumentParser, shows: str) -> None:
     """Add the option --html; `check_html` checks before the work whether it is available."""
-    parser.add_argument("--html", metavar="F", help=f"{shows}; one file, no network")
+    parser.add_argument("--html", metavar="F", help=f"{shows}; a single file that works offline")
 
 
 def check_html(options: argparse.Namespace) -> None:
@@ -117,7 +121,7 @@ def natural(text: str) -> int:
     except ValueError:
         value = -1
     if value < 0:
-        raise argparse.ArgumentTypeError(f"must be a whole number, not negative, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a non-negative whole number, got {text!r}")
     return value
 
 

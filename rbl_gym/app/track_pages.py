@@ -20,8 +20,8 @@ from rbl_gym.studies.replay import Replayed, origin_of, truth_of
 
 _LEGEND = (
     "Drag to turn, wheel to zoom; play, or move the slider. Shaded: three sigma of the belief "
-    "(errors and sigma of all axes together). NEES: the band holds 95 % of the epochs of an "
-    "honest filter, the dotted line is their mean."
+    "(errors and sigma of all axes together). NEES: the band has 95 % of the epochs of a "
+    "consistent filter, the dotted line is its mean."
 )
 
 
@@ -56,9 +56,9 @@ def demo_page(result: dict[str, Any], example: Example) -> str:
         "<h2>All trials</h2>",
         page.plot(_curves(result), "curves", first=False),
         page.note(
-            "Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward "
-            "= -log b, b the expected RMS error of the tags in metres; NEES of an honest "
-            f"filter is 6. Assumed, for the paper does not print it: {assumed}."
+            "Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward = "
+            "-log b, b the expected RMS error of the tags in metres. The NEES of a consistent "
+            f"filter is 6. Assumed, as the paper does not print it: {assumed}."
         ),
         page.table(f"filters, {result['trials']} trials", headings, rows),
         page.table("claims", ["of", "claim", "holds", "figures"], claims),
@@ -177,7 +177,7 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
         parts.append(
             page.note(
-                f"NEES per degree of freedom {result['anees']:.2f} (1: honest); "
+                f"NEES per degree of freedom {result['anees']:.2f} (1: consistent); "
                 f"{'; '.join(compared(result))}."
             )
         )

@@ -133,7 +133,7 @@ def range_information(
     for name, given in (("offset", offset), ("anchor_std_m", anchor_std)):
         if given is not None and (model != "raw" or tag_std_m != 0):
             raise ValueError(
-                f"{name} goes with model 'raw' and tag_std_m 0, got {model!r} and {tag_std_m!r}"
+                f"{name} needs model 'raw' and tag_std_m = 0, got {model!r} and {tag_std_m!r}"
             )
     tags = check_array("tags", tags, ("N", 3))
     rotation = rotations.check_rotation("rotation", rotation)

@@ -250,7 +250,9 @@ def marginal_information(joint: ArrayLike, states: int = 6) -> FloatArray:
     except np.linalg.LinAlgError:
         found = np.full((states, states), np.nan)
     if not np.isfinite(found).all():
-        raise ValueError(f"joint must be information, positive semidefinite, got {joint!r:.80}")
+        raise ValueError(
+            f"joint must be an information matrix (positive semidefinite), got {joint!r:.80}"
+        )
     return found
 
 

@@ -66,8 +66,8 @@ def inverted(information: FloatArray, more: str) -> FloatArray:
     if (rank < 6).any():
         where = tuple(int(i) for i in np.argwhere(rank < 6)[0])
         raise ValueError(
-            f"the geometry does not determine the pose: information of rank {int(rank.min())} "
-            f"of 6 at batch index {where}; add {more}, or prior_information"
+            "the geometry does not determine the pose: its information has rank "
+            f"{int(rank.min())} of 6 at batch index {where}; add {more}, or give prior_information"
         )
     return np.linalg.inv(information)
 

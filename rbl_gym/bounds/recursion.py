@@ -55,13 +55,13 @@ def posterior_step(
     sizes = (6, 12, 15, 17) if motion is None else motion.sizes
     if J.shape[-2] != J.shape[-1] or states not in sizes:
         wanted = " or ".join(f"(..., {n + count}, {n + count})" for n in sizes)
-        more = f" with {count} states of nuisances" * (count > 0)
+        more = f" with {count} nuisance states" * (count > 0)
         raise ValueError(f"J must have shape {wanted}{more}, got {J.shape}")
     if motion is not None:
         motion = motion.checked()
         J = motion.predict(J, states, np.asarray(epoch.rotation))
         if not np.isfinite(J).all():
-            raise ValueError("J must be information about all states, got a singular one")
+            raise ValueError("J must be information about all states, got a singular matrix")
         rows = nuisances.bias_rows(anchors, tags)
         J = nuisances.faded(J, 0 if rows is None else len(rows), motion.seconds)
     told = information_of(epoch, nuisances, epoch.links)  # pyright: ignore[reportArgumentType]

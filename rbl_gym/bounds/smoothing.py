@@ -93,7 +93,8 @@ def smoothing_crb(
     K = seen.shape[-3]
     if F.shape[-3] != K - 1:
         raise ValueError(
-            f"twists must be of {K - 1} intervals between {K} epochs, got {F.shape[-3]}"
+            f"twists must have {K - 1} entries, one for each interval between the {K} epochs, got "
+            f"{F.shape[-3]}"
         )
     diagonal, above = np.zeros((*batch, K, n, n)), np.zeros((*batch, K, n, n))
     diagonal[..., :6, :6] = seen

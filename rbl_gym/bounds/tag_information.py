@@ -37,7 +37,9 @@ def inverse_variance(variance: FloatArray, distance: FloatArray) -> FloatArray:
         weight = np.where(distance > 0, 1 / variance, 0.0)
     if not np.isfinite(weight).all():
         where = np.broadcast_to(distance, weight.shape)[~np.isfinite(weight)][0]
-        raise ValueError(f"noise must have a variance at every distance, got 0 at {where:g} m")
+        raise ValueError(
+            f"noise must have a positive variance at every distance, got 0 at {where:g} m"
+        )
     return weight
 
 

@@ -60,7 +60,9 @@ def checked_world(found: Scene) -> Scene:
     if found.n_anchors != 1:
         raise ValueError(f"scene must have n_anchors = 1, got {found.n_anchors}")
     if found.links != LinkModel() or found.weakens:
-        raise ValueError("scene must have neither links that fail nor obstacles")
+        raise ValueError(
+            "scene must have no failing links and no obstacles: angles are measured in every step"
+        )
     return found
 
 
@@ -74,8 +76,8 @@ def family_of_worlds(members: Any) -> SceneFamily:
     counts = {len(checked_world(one).tags) for one in found.corners}
     if len(counts) > 1:
         raise ValueError(
-            f"scenes must have bodies of one number of tags, got {sorted(counts)}: angles have no "
-            "masks"
+            "scenes must have bodies with the same number of tags, as angles cannot be masked; "
+            f"got {sorted(counts)} tags"
         )
     return found
 

@@ -157,7 +157,9 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         seeds = seeds_of(seed, self.num_envs)
         if not self._generators:
             if not mask.all():
-                raise gym.error.ResetNeeded("reset all environments before some of them")
+                raise gym.error.ResetNeeded(
+                    "call reset() for all environments before resetting some of them"
+                )
             self._generators = [seeding.np_random(one)[0] for one in seeds]
         else:
             for i in np.flatnonzero(mask):
@@ -177,7 +179,8 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         ended = self._done.copy()
         if ended.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
-                "episodes are over: reset (some of many: options['reset_mask'])"
+                "some episodes are over: call reset(), with options={'reset_mask': mask} to "
+                "reset only these"
             )
         moving = ~ended
         self._epochs[moving] += 1
@@ -299,7 +302,7 @@ def check_options(options: Any, known: tuple[str, ...] = ()) -> None:
     for key in options:
         if key not in known:
             raise ValueError(
-                f"options must have no key but {', '.join(known)}, got {key!r:.80}"
+                f"options may only have the keys {', '.join(known)}, got {key!r:.80}"
                 if known
                 else f"options must be empty or None, got {key!r:.80}"
             )
@@ -320,7 +323,7 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
 
 def _seed(seed: Any) -> int | None:
     if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
-        raise ValueError(f"seed must be an int that is not negative, or None, got {seed!r:.80}")
+        raise ValueError(f"seed must be a non-negative int or None, got {seed!r:.80}")
     return None if seed is None else int(seed)
 
 

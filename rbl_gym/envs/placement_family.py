@@ -53,7 +53,10 @@ class PlacementFamilyVectorEnv(PlacementBatchEnv):
         self._check_flags(mode, mirror, sight)
         corners = self.family.corners
         if self.sight and not all(isinstance(t.scene.anchor_region, Walls) for t in corners):
-            raise ValueError("scenes must be rooms with walls for mount points and their sight")
+            raise ValueError(
+                "scenes must be rooms with walls, as mode='mounts' and sight=True use their "
+                "mount points"
+            )
         m, k = self.family.most_anchors, self.family.most_boxes
         self._plan(corners[0], m, 6 + 7 * k + DESCRIBED + m)
         steps = self._placements + 1

@@ -69,7 +69,7 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
         # As `BatchEnv.step`, without the masks of many worlds.
         batch = self._batch
         if not batch._generators or batch._done[0]:
-            raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
         actions = check_actions("action", action, self.action_space)[None]
         batch._epochs[0] += 1
         reward, over = batch._advance(actions, _ALONE)

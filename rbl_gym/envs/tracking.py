@@ -194,7 +194,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Move the anchors, then the body, then measure."""
         if self._episode is None or self._epoch >= self.scene.steps:
-            raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
         if self.scene.anchor_speed_m_s > 0:
             velocities = check_action(action, 3 * (self.family or self.scene).n_anchors)
             velocities = velocities[: 3 * self.scene.n_anchors]
@@ -268,8 +268,8 @@ def check_reward(reward: Any, family: SceneFamily | None) -> str:
     check_one_of("reward", reward, REWARDS)
     if reward == "bound" and family is not None and family.is_surveyed:
         raise ValueError(
-            "reward must be 'none' with scenes that have survey_std_m: their bounds have states of "
-            "different sizes"
+            "reward must be 'none' with scenes that have survey_std_m: the states of their "
+            "bounds differ in size"
         )
     return reward
 

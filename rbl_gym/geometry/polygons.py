@@ -55,7 +55,9 @@ def check_polygon(name: str, polygon: ArrayLike) -> FloatArray:
     ring = check_line(name, polygon, closed=True)
     extent = float(np.ptp(ring, axis=0).max())
     if abs(area(ring)) <= TOUCH_M * extent:
-        raise ValueError(f"{name} must have an area, its {len(ring)} corners lie on one line")
+        raise ValueError(
+            f"{name} must enclose an area, but its {len(ring)} corners lie on one line"
+        )
     _check_simple(name, ring)
     return ring if area(ring) > 0 else ring[::-1].copy()
 
@@ -71,7 +73,7 @@ def _check_simple(name: str, ring: FloatArray) -> None:
     back = (np.abs(turn) <= TOUCH_M) & ((along * after).sum(axis=1) < 0)
     if back.any():
         where = end[back.argmax()]
-        raise ValueError(f"{name} must not fold back on itself, as it does at {_show(where)}")
+        raise ValueError(f"{name} must not fold back on itself, but does so at {_show(where)}")
     for i in range(count - 2):
         # Edge i, and edges j from the next but one to the last that is not a neighbour.
         j = np.arange(i + 2, count - (i == 0))

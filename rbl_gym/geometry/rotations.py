@@ -343,7 +343,9 @@ def check_rotation(name: str, Q: ArrayLike, *, tolerance: float = ORTHOGONAL) ->
     Q = check_array(name, Q, (3, 3))
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(initial=0.0)
     if defect > tolerance:
-        raise ValueError(f"{name} must be orthogonal, Q Q^T is off the identity by {defect:.3g}")
+        raise ValueError(
+            f"{name} must be orthogonal, but Q Q^T differs from the identity by {defect:.3g}"
+        )
     if (np.linalg.det(Q) < 0).any():
         raise ValueError(f"{name} must be a proper rotation, got a reflection (determinant -1)")
     return Q

@@ -228,7 +228,9 @@ def check_angles(value: ArrayLike, n_tags: int, name: str = "angles") -> FloatAr
     wrong = (checked < -0.1) | (checked > np.pi + 0.1)
     if wrong.any():
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
-        raise ValueError(f"{name} must be radians on [0, pi], got {checked[index]} at {index}")
+        raise ValueError(
+            f"{name} must be angles in radians on [0, pi], got {checked[index]} at {index}"
+        )
     return fold(checked)
 
 

@@ -155,7 +155,7 @@ def sensor(value: str | Mapping[str, Any] | InertialSensor) -> InertialSensor:
     known = list(InertialSensor.__dataclass_fields__)
     for key, number in value.items():
         if key != "kind" and key not in known:
-            raise ValueError(f"inertial has no field {key!r}; it has {', '.join(known)}")
+            raise ValueError(f"inertial has no field {key!r}; its fields are {', '.join(known)}")
         fields[key] = number
     return InertialSensor(**{key: fields[key] for key in known})
 

@@ -71,7 +71,9 @@ class RangeNoise:
         check_number("floor_m", self.floor_m, low=0.0)
         check_number("proportional", self.proportional, low=0.0)
         if self.floor_m == 0 and self.proportional == 0:
-            raise ValueError("floor_m and proportional must not both be zero: noise-free ranges")
+            raise ValueError(
+                "floor_m and proportional must not both be zero: the ranges would be free of noise"
+            )
         tag = self.reference_tag
         if tag is not None and (isinstance(tag, bool) or not isinstance(tag, Integral)):
             raise ValueError(f"reference_tag must be None or an int, got {tag!r}")

@@ -104,7 +104,8 @@ def check_steps(steps: ArrayLike, readings: FloatArray, name: str = "steps") -> 
     count = readings.shape[-2]
     if steps.ndim and steps.shape[-1] != count:
         raise ValueError(
-            f"{name} must be one, or one for each of {count} samples, got {steps.shape}"
+            f"{name} must be one number, or one for each of {count} samples, got shape "
+            f"{steps.shape}"
         )
     return steps if steps.ndim else np.full(count, steps)
 
@@ -272,7 +273,7 @@ def attitude(
     if (np.abs(magnitude / usual - 1) > 0.5).any():
         raise ValueError(
             f"readings must have a mean specific force near {usual:.2f} m/s^2, got "
-            f"{float(magnitude.flat[0]):.3g} (is it in units of g, or without gravity?)"
+            f"{float(magnitude.flat[0]):.3g} (are they in units of g, or was gravity removed?)"
         )
     up = force / magnitude
     # The row of the rotation that is the world vertical. Yaw 0: the body x axis has no y component.

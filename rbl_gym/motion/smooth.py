@@ -73,8 +73,8 @@ def bspline(
     count = p.shape[-2]
     if R.ndim < 3 or R.shape[-3] != count or count < 2:
         raise ValueError(
-            f"rotation and translation must hold the same 2 poses or more, got {R.shape} and "
-            f"{p.shape}"
+            "rotation and translation must hold the same number of poses, at least 2, got shapes "
+            f"{R.shape} and {p.shape}"
         )
     at = times / spacing_s
     if times.ndim != 1 or at.min() < 0 or at.max() > count - 2 + 1e-9:
@@ -143,8 +143,8 @@ def through(
         raise ValueError("times must be (K,) with K >= 2 and strictly increasing")
     if rotation.shape != (count, 3, 3) or translation.shape != (count, 3):
         raise ValueError(
-            f"rotation and translation must be of {count} times, got {rotation.shape} and "
-            f"{translation.shape}"
+            f"rotation and translation must hold {count} poses, one for each time, got shapes "
+            f"{rotation.shape} and {translation.shape}"
         )
     if at.ndim != 1 or at.min() < times[0] or at.max() > times[-1]:
         raise ValueError(f"at must lie in [{times[0]:g}, {times[-1]:g}], got {at.min():g}")

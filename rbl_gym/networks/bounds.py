@@ -275,7 +275,7 @@ def frame_covariance(
     if len(values) and values[0] <= 1e-12 * values[-1]:
         missing = int((values <= 1e-12 * values[-1]).sum())
         raise ValueError(
-            f"edges must determine all frames, got {missing} directions without information"
+            f"edges must determine all frames, but {missing} directions have no information"
         )
     factor = basis @ vectors / np.sqrt(values)
     return factor @ factor.T
@@ -345,7 +345,7 @@ def space_orientation_covariance(
     values = np.linalg.svd(known, compute_uv=False)
     if values[-1] < 1e-9 * values[0]:
         raise ValueError(
-            "edges must determine all orientations at these positions, got "
-            f"{int((values < 1e-9 * values[0]).sum())} free motions"
+            "edges must determine all orientations at these positions, but "
+            f"{int((values < 1e-9 * values[0]).sum())} motions remain free"
         )
     return sigma**2 * np.linalg.inv(known.T @ known)[3 * (n_nodes - 1) :, 3 * (n_nodes - 1) :]

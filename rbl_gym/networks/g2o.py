@@ -120,7 +120,9 @@ def _g2o_rows(path: str) -> _Rows:
         elif tag == "EDGE_SE2":
             if len(cells) == 5:
                 cells += [""] * len(_INFORMATION)
-            _count(path, number, cells, 11, " (5 where there is no information)")
+            _count(
+                path, number, cells, 11, " (5 values are allowed too: an edge without information)"
+            )
             lines.append(number)
             ends.append(_ends(path, number, cells))
             values.append(_numbers(path, number, names, cells[2:]))
@@ -128,14 +130,13 @@ def _g2o_rows(path: str) -> _Rows:
             skipped[tag] += 1
         elif tag != "FIX":
             raise ValueError(
-                f"{path}, line {number}: must start with EDGE_SE2 or another name of "
-                f"g2o, got {tag!r:.40}"
+                f"{path}, line {number}: must start with EDGE_SE2 or another keyword of g2o, got "
+                f"{tag!r:.40}"
             )
     if not lines:
         told = ", ".join(f"{n} {tag}" for tag, n in skipped.items())
         raise ValueError(
-            f"{path}: must have an edge, got none of EDGE_SE2"
-            + (f"; skipped: {told}" if told else "")
+            f"{path}: must have an edge, got no EDGE_SE2" + (f"; skipped: {told}" if told else "")
         )
     return _Rows(lines, ends, dict(zip(names, np.array(values).T, strict=True)), skipped, vertices)
 
@@ -150,8 +151,8 @@ def _csv_rows(path: str) -> _Rows:
     extra += list(_INFORMATION) if set(_INFORMATION) & set(names) else []
     if sorted(names) != sorted([*wanted, *extra]):
         raise ValueError(
-            f"{path}, line {number}: columns must be i, j and dtheta (or y; or a, b), then dx, "
-            f"dy, I11 to I33 or not, got {', '.join(names)!r:.120}"
+            f"{path}, line {number}: columns must be i, j and dtheta (or y; or a and b), and "
+            f"optionally dx, dy and I11 to I33; got {', '.join(names)!r:.120}"
         )
     order = [names.index(name) for name in ("i", "j", *angle, *extra)]
     others = (*angle, *extra)
@@ -175,7 +176,9 @@ def _lines(path: str) -> Iterator[tuple[int, str]]:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read, {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be UTF-8 text, {error.reason} at {error.start}") from error
+        raise ValueError(
+            f"{path}: must be UTF-8 text, {error.reason} at byte {error.start}"
+        ) from error
     for number, line in enumerate(text.split("\n"), start=1):
         line = line.strip()
         if line and not line.startswith("#"):

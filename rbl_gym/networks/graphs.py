@@ -180,7 +180,9 @@ def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: in
     """
     C = sp.csr_matrix(cycles, dtype=np.float64, copy=True)
     if C.shape[1] != len(edges):
-        raise ValueError(f"cycles must have a column per edge, {len(edges)}, got {C.shape}")
+        raise ValueError(
+            f"cycles must have {len(edges)} columns, one for each edge, got shape {C.shape}"
+        )
     C.sum_duplicates()
     C.eliminate_zeros()
     if not (np.abs(C.data) == 1).all():
@@ -188,7 +190,7 @@ def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: in
         raise ValueError(f"cycles must have entries -1, 0 and 1, got {wrong:g}")
     open_ = np.unique((C @ incidence(edges, n_nodes)).nonzero()[0])
     if len(open_):
-        raise ValueError(f"cycles must be closed walks, got one that is not in row {open_[0]}")
+        raise ValueError(f"cycles must be closed walks, but row {open_[0]} is an open one")
     return C
 
 
@@ -293,8 +295,8 @@ def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
                     walks.append(list(zip(nodes, [*rows, row], strict=True)))
                     if len(walks) > _MOST_CYCLES:
                         raise ValueError(
-                            f"edges must have at most {_MOST_CYCLES:,} cycles to "
-                            "list all of them, got more"
+                            f"a graph must have at most {_MOST_CYCLES:,} cycles to list all of "
+                            "them, this one has more"
                         )
                 elif free >> other & 1 and comes_back(other, start, free ^ 1 << other):
                     free ^= 1 << other

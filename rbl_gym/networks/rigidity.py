@@ -76,8 +76,8 @@ def check_orientations(edges: ArrayLike, n_nodes: int, measured: str = "bearings
     check_connected(edges, n_nodes)
     if measured == "ranges" and n_nodes > 1:
         raise ValueError(
-            "orientations are not localizable from ranges alone: turning a node "
-            "changes no range; bearings must be measured, got 'ranges'"
+            "orientations are not localizable from ranges alone, as turning a node changes no "
+            "range: measured must be 'bearings' or 'both', got 'ranges'"
         )
 
 
@@ -122,8 +122,7 @@ def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
     rank, full = parallel_rigidity_rank(positions, edges)
     if rank < full:
         raise ValueError(
-            f"edges must make the network parallel rigid, rank {full}, "
-            f"got rank {rank}: {full - rank} missing"
+            f"edges must make the network parallel rigid, which takes rank {full}; got rank {rank}"
         )
 
 
@@ -140,8 +139,8 @@ def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> No
     missing = _null_dimension(sp.csr_matrix(J)) - 3
     if missing:
         raise ValueError(
-            f"edges and ranges must determine all frames, rank {full}, "
-            f"got rank {full - missing}: {missing} missing"
+            f"edges and ranges must determine all frames, which takes rank {full}; got rank "
+            f"{full - missing}"
         )
 
 
@@ -248,7 +247,7 @@ def _unit(name: str, vector: ArrayLike) -> FloatArray:
     array = check_array(name, vector, (3,))
     length = float(np.linalg.norm(array))
     if array.shape != (3,) or length == 0:
-        raise ValueError(f"{name} must be one vector that is not zero, got {array!r:.80}")
+        raise ValueError(f"{name} must be one nonzero vector, got {array!r:.80}")
     return array / length
 
 

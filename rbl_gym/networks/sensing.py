@@ -81,7 +81,7 @@ def check_edge_values(
     if array.size == 0 == len(edges):
         return np.zeros(shape)
     if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape} like the edges, got {array.shape}")
+        raise ValueError(f"{name} must have shape {shape}, a row for each edge, got {array.shape}")
     return check_finite(name, array)
 
 

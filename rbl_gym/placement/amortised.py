@@ -259,7 +259,7 @@ def of_problem(
     evaluations = check_count("evaluations", evaluations, least=0)
     seen, network = scenery.of_problem(problem), network or load()
     if KINDS[seen.kind] == "mounts" and len(seen.candidates) < count:
-        raise ValueError("anchors have no legal place: obstacles cover all of them")
+        raise ValueError("anchors have no permitted place: obstacles cover all of them")
     smooth = KINDS[seen.kind] != "mounts" and not problem.obstacles
     found = [
         _legal(problem.mounts, problem.obstacles, seen, places(network, seen, count, image))

@@ -25,7 +25,7 @@ def check_problem(problem: Problem) -> Problem:
         name = zone.name if zone.name == "region" else f"zones[{index}] ({zone.name!r})"
         _check_zone(problem, zone, name)
     if problem.obstacles.contain(problem.mounts.draw(cube(4000))).all():
-        raise ValueError("anchors have no legal place: obstacles cover all of them")
+        raise ValueError("anchors have no permitted place: obstacles cover all of them")
     check_numbers(problem)
     return problem
 
@@ -57,13 +57,13 @@ def _check_tags(problem: Problem) -> None:
             continue
         if zone.attitude == "heading":
             raise ValueError(
-                f"tags must not stand above each other in zone {zone.name!r}, which asks for a "
+                f"tags must not all lie on one vertical line, as zone {zone.name!r} requires a "
                 "heading"
             )
         raise ValueError(
-            f"tags must be at least 3 and not on one line, got {len(tags)}: no ranges tell how "
-            'such a body is turned. Fewer do in [[zones]] with attitude = "heading", or with '
-            "position_m alone"
+            f"tags must be at least 3 and not on one line, got {len(tags)}: ranges do not "
+            "determine the rotation of such a body. Fewer tags are enough in [[zones]] with "
+            'attitude = "heading", or with position_m as the only requirement'
         )
 
 
@@ -72,8 +72,8 @@ def _check_fixed(problem: Problem) -> None:
     if held.any():
         index = int(held.argmax())
         raise ValueError(
-            f"anchors.fixed[{index}] = {show(problem.fixed[index])} lies inside an obstacle: it "
-            "would see nothing past it; put it in front of the face"
+            f"anchors.fixed[{index}] = {show(problem.fixed[index])} lies inside an obstacle, "
+            "which blocks its links: put it in front of the face"
         )
 
 
@@ -82,7 +82,7 @@ def _check_zone(problem: Problem, zone: Zone, name: str) -> None:
     low, high = zone.bounds()
     for index, (centre, half) in enumerate(problem.obstacles.boxes.reshape(-1, 2, 3)):
         if (centre - half <= low).all() and (centre + half >= high).all():
-            raise ValueError(f"obstacles[{index}] swallows the whole {name}")
+            raise ValueError(f"obstacles[{index}] covers the whole {name}")
     places = free_places(zone, problem.obstacles, _PLACES)
     if not len(places):
         where = "region" if name == "region" else name
@@ -98,8 +98,9 @@ def _check_zone(problem: Problem, zone: Zone, name: str) -> None:
     extent = _extent(problem)
     if name != "region" and nearest > extent:
         raise ValueError(
-            f"{name} is {nearest:.4g} m from the nearest mount, farther than the mounts are "
-            f"wide ({extent:.4g} m): are its coordinates in metres, and of this building?"
+            f"{name} is {nearest:.4g} m from the nearest mount, farther than the size of the "
+            f"building ({extent:.4g} m): are its coordinates in metres, and in the axes of this "
+            "building?"
         )
 
 
@@ -120,12 +121,12 @@ def check_numbers(problem: Problem) -> None:
     n_fixed = len(problem.fixed)
     if problem.n_anchors < n_fixed:
         raise ValueError(
-            f"the number of anchors counts the fixed ones: at least {n_fixed} of anchors.fixed, "
-            f"got {problem.n_anchors}"
+            f"the number of anchors includes the fixed ones: it must be at least {n_fixed}, the "
+            f"number of anchors.fixed, got {problem.n_anchors}"
         )
     listed = problem.mounts.listed()
     if listed is not None and len(listed) < problem.n_anchors - n_fixed:
         raise ValueError(
-            f"mounts list {len(listed)} legal points, too few for {problem.n_anchors} anchors of "
-            f"which {n_fixed} are fixed"
+            f"mounts have {len(listed)} permitted points, too few for the "
+            f"{problem.n_anchors - n_fixed} anchors that are not fixed"
         )

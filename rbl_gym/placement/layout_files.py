@@ -59,7 +59,7 @@ def parse_layout(path: str, content: bytes) -> Layout:
     missing = [name for name in _AXES if name not in header]
     if missing:
         raise ValueError(
-            f"{path}: the first line must name the columns x_m, y_m, z_m and may have name; "
+            f"{path}: the first line must name the columns x_m, y_m, z_m and optionally name; "
             f"{', '.join(missing)} not found in {first.strip()[:80]!r}"
         )
     columns = [header.index(name) for name in _AXES]
@@ -67,7 +67,10 @@ def parse_layout(path: str, content: bytes) -> Layout:
     names, positions = [], []
     for line, row in rows[1:]:
         if len(row) != len(header):
-            raise ValueError(f"{path}, line {line}: {len(header)} cells needed, got {len(row)}")
+            raise ValueError(
+                f"{path}, line {line}: must have {len(header)} cells like the header, got "
+                f"{len(row)}"
+            )
         positions.append([_number(path, line, header[k], row[k]) for k in columns])
         names.append(str(len(names) + 1) if at_name is None else row[at_name].strip())
         if not names[-1] or names.index(names[-1]) < len(names) - 1:
@@ -76,7 +79,7 @@ def parse_layout(path: str, content: bytes) -> Layout:
                 f"got {names[-1]!r}"
             )
     if not positions:
-        raise ValueError(f"{path}: no anchor in it")
+        raise ValueError(f"{path}: must have at least one anchor, got none")
     return Layout(tuple(names), np.array(positions))
 
 

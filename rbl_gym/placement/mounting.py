@@ -182,6 +182,6 @@ def _shapely() -> Any:
         import shapely  # an extra
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "[[mounts]] need the package shapely: pip install 'rbl-gym[placement]'"
+            "files with [[mounts]] need the package shapely: pip install 'rbl-gym[placement]'"
         ) from error
     return shapely

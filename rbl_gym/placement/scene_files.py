@@ -67,7 +67,9 @@ def problem(
     """
     if Path(scene).suffix.lower() in (".toml", ".json"):
         if racks:
-            raise ValueError(f"racks must be 0 with a file, got {racks}: list them as obstacles")
+            raise ValueError(
+                f"racks must be 0 with a file, got {racks}: list the racks as obstacles in the file"
+            )
         tables = load(scene)
         path = Path(scene)
         try:
@@ -177,8 +179,8 @@ def check_n_anchors(number: Any) -> int:
         raise ValueError(f"the number of anchors must be a whole number, got {number!r:.80}")
     if not MIN_ANCHORS <= number <= MAX_ANCHORS:
         raise ValueError(
-            f"the number of anchors must be {MIN_ANCHORS} to {MAX_ANCHORS}, got {number}: "
-            "fewer than 3 never tell a pose"
+            f"the number of anchors must be {MIN_ANCHORS} to {MAX_ANCHORS}, got {number}: fewer "
+            "than 3 never determine a pose"
         )
     return number
 
@@ -233,7 +235,7 @@ def _mounts(
     if not rows:
         if forbidden:
             raise ValueError(
-                f"forbidden means nothing with anchors.kind = {kind!r}: list [[mounts]]"
+                f"forbidden has no effect with anchors.kind = {kind!r}: use [[mounts]]"
             )
         sizes = ("inner_m", "outer_m") if kind == "shell" else ("low", "high")
         return _named("anchors", _REGIONS[kind], **{key: anchors[key] for key in sizes})
@@ -245,7 +247,7 @@ def _mounts(
     )
     if mounts is None:
         raise ValueError(
-            "mounts have no legal place: obstacles and [[forbidden]] cover all of them"
+            "mounts have no permitted place: obstacles and [[forbidden]] cover all of them"
         )
     return mounts
 
@@ -256,10 +258,12 @@ def _zones(rows: list[dict[str, Any]]) -> tuple[Zone, ...]:
         name = f"zones[{index}]"
         asked = {key: row[key] for key in _REQUIREMENTS}
         if row["share"] is not None and not any(asked.values()):
-            raise ValueError(f"{name}.share means nothing without {', '.join(_REQUIREMENTS)}")
+            raise ValueError(f"{name}.share needs one of {', '.join(_REQUIREMENTS)}")
         title = row["name"] or f"zone {index + 1}"
         if title in (zone.name for zone in zones):
-            raise ValueError(f"{name}.name must differ from the others, got {title!r} twice")
+            raise ValueError(
+                f"{name}.name must differ from the names of the other zones, got {title!r} twice"
+            )
         if "polygon" in row:
             polygon, low, high = row["polygon"], row["low_m"], row["high_m"]
         else:
@@ -276,8 +280,8 @@ def _region(table: Any) -> Zone:
     for key in as_table(table, "region"):
         if key in (*_REQUIREMENTS, "share"):
             raise ValueError(
-                f"region has an unknown key {key!r}; it may have low, high: for a "
-                "requirement use [[zones]], in place of [region], each with low, high, "
+                f"region has an unknown key {key!r}; it may have low and high. For a requirement "
+                "use [[zones]] in place of [region], each with low, high, "
                 f"{', '.join(_REQUIREMENTS)}, share"
             )
     values = read_table("region", table)
@@ -307,7 +311,7 @@ def _tags(table: Any) -> FloatArray:
     if ("tags" in table) == ("shape" in table):
         raise ValueError("body must have either tags, a list of [x, y, z], or a shape")
     if "tags" in table and "size_m" in table:
-        raise ValueError("body.size_m means nothing beside tags")
+        raise ValueError("body.size_m must be left out where body.tags is given")
     values = read_table("body", table)
     if "tags" in values:
         return check_array("body.tags", values["tags"], ("N", 3))
@@ -321,7 +325,7 @@ def _gain(anchors: dict[str, Any]) -> Gain:
     }
     for edge, limit in (("range_edge_m", "max_range_m"), ("angle_edge_deg", "half_angle_deg")):
         if anchors[edge] and anchors[limit] is None:
-            raise ValueError(f"anchors.{edge} means nothing without anchors.{limit}")
+            raise ValueError(f"anchors.{edge} needs anchors.{limit}")
         if anchors[limit] is not None and anchors[edge] > anchors[limit]:
             raise ValueError(
                 f"anchors.{edge} must be at most anchors.{limit} = {anchors[limit]:g}, "

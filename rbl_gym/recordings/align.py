@@ -85,16 +85,16 @@ def align_positions(source: ArrayLike, target: ArrayLike, mode: str = "se3") -> 
         cosine, sine = spread[0, 0] + spread[1, 1], spread[1, 0] - spread[0, 1]
         if np.hypot(cosine, sine) <= (_ROUNDING * size) ** 2:
             raise ValueError(
-                f"the positions do not determine a heading ({len(source)} of them, all at one "
-                "place from above): align by position"
+                f"the {len(source)} positions do not determine a heading, as they differ only in "
+                "height: align by 'position'"
             )
         R = rotations.exp([0.0, 0.0, np.arctan2(sine, cosine)])
     elif mode == "se3":
         values = np.linalg.svd(spread, compute_uv=False)
         if values[1] <= max(_FLAT * values[0], (_ROUNDING * size) ** 2):
             raise ValueError(
-                f"the positions do not determine a rotation ({len(source)} of them, along a line "
-                "or at one place): align by yaw or position"
+                f"the {len(source)} positions do not determine a rotation, as they lie on a line "
+                "or at one place: align by 'yaw' or 'position'"
             )
         R = rotations.nearest(spread)
     turn = float(np.linalg.norm(rotations.log(R)))

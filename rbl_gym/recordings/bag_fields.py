@@ -48,8 +48,9 @@ def getter(path: str) -> Getter:
     parts = path.split(".")
     if not all(_NAME.fullmatch(part) for part in parts) or path.count("[]") > 1:
         raise ValueError(
-            f"{path!r} is no field path: must be names joined by dots, [3] for an item of a list "
-            "and [] once for all of them, =TEXT for a constant, @topic, @index or @bag"
+            f"{path!r} is not a field path. A path is names joined by dots, with [3] for an item "
+            "of a list and [] at most once for all items; or =TEXT for a constant; or @topic, "
+            "@index or @bag"
         )
     return lambda received: _walk(received.message, parts)
 
@@ -67,7 +68,9 @@ def rows(received: Received, getters: Iterable[Getter]) -> list[tuple[Any, ...]]
     if not lengths:
         return [tuple(0 if value is _INDEX else value for value in values)]
     if len(lengths) > 1:
-        raise ValueError(f"lists of one message must be equally long, got {sorted(lengths)} items")
+        raise ValueError(
+            f"lists in one message must have the same length, got {sorted(lengths)} items"
+        )
     count = lengths.pop()
     columns = (
         value
@@ -90,14 +93,14 @@ def _special(path: str) -> Getter:
         "@index": lambda _: _INDEX,
     }
     if path not in known:
-        raise ValueError(f"{path!r} must be of {[*known]}")
+        raise ValueError(f"{path!r} must be one of {[*known]}")
     return known[path]
 
 
 def _template(path: str) -> Getter:
     inner = [getter(name) for name in re.findall(r"{(.*?)}", path)]
     if "{@index}" in path:
-        raise ValueError(f"{path!r}: @index must stand alone")
+        raise ValueError(f"{path!r}: @index must be the whole path")
     form = re.sub(r"{.*?}", "{}", path)
 
     def fill(received: Received) -> Any:

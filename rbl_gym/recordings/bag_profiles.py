@@ -134,13 +134,13 @@ def check_mapping(mapping: Mapping[str, Any]) -> None:
     """Raise ValueError if a table or a key is unknown."""
     for kind, table in mapping.items():
         if kind not in KEYS:
-            raise ValueError(f"unknown table [{kind}], must be of {[*KEYS]}")
+            raise ValueError(f"unknown table [{kind}], must be one of {[*KEYS]}")
         if not isinstance(table, Mapping):
             raise ValueError(f"[{kind}] must be a table of keys and values, got {table!r:.60}")
         known = [*_EVERYWHERE, *KEYS[kind]]
         for key in table:
             if key not in known:
-                raise ValueError(f"[{kind}] unknown key {key!r}, must be of {known}")
+                raise ValueError(f"[{kind}] unknown key {key!r}, must be one of {known}")
 
 
 def sources(
@@ -172,7 +172,8 @@ def sources(
             )
         elif table:
             raise ValueError(
-                f"[{kind}] topic is missing: none is taken by itself, there are {_listed(topics)}"
+                f"[{kind}] topic is missing and cannot be chosen automatically, the topics are "
+                f"{_listed(topics)}"
             )
     return found, notes
 
@@ -192,14 +193,14 @@ def _candidates(kind: str, topics: Mapping[str, str]) -> tuple[list[str], str]:
         if fnmatchcase(topic, pattern)
     ]
     if len(names) > 1 and len(preferred) != 1:
-        return [], f"no {kind} written, several topics could be it: {', '.join(names)}"
+        return [], f"{kind} not written, as several topics are possible: {', '.join(names)}"
     return (preferred or names), ""
 
 
 def _matching(kind: str, pattern: str, topics: Mapping[str, str]) -> list[str]:
     names = [topic for topic in topics if fnmatchcase(topic, pattern)]
     if not names:
-        raise ValueError(f"[{kind}] no topic {pattern!r}, there are {_listed(topics)}")
+        raise ValueError(f"[{kind}] no topic {pattern!r}, the topics are {_listed(topics)}")
     return names
 
 
@@ -209,20 +210,21 @@ def _filled(
     """Return the table, filled in from the message type."""
     types = {topics[name] for name in names}
     if len(types) > 1:
-        raise ValueError(f"[{kind}] topics must be of one type, got {sorted(types)}")
+        raise ValueError(f"[{kind}] topics must have the same message type, got {sorted(types)}")
     msgtype = types.pop()
     full = {**_TYPES[kind].get(msgtype, {}), **table}
     if missing := [key for key in REQUIRED[kind] if not full.get(key)]:
         raise ValueError(
-            f"[{kind}] topic {names[0]} is of type {msgtype}: say where {', '.join(missing)} stands"
+            f"[{kind}] topic {names[0]} is of type {msgtype}: give the field paths of "
+            f"{', '.join(missing)}"
         )
     for key, place in zip(("parent", "child"), _FRAMES.get(msgtype, ()), strict=False):
         if key in full:
             full["where"] = {**full.get("where", {}), place: full.pop(key)}
     if msgtype == "tf2_msgs/msg/TFMessage" and len(full.get("where", {})) < 2:
-        raise ValueError(f"[{kind}] {names[0]} holds many frames: give parent and child")
+        raise ValueError(f"[{kind}] {names[0]} has messages of many frames: give parent and child")
     if frames := [key for key in ("parent", "child") if key in full]:
-        raise ValueError(f"[{kind}] {frames[0]}: messages of type {msgtype} name no such frame")
+        raise ValueError(f"[{kind}] {frames[0]}: messages of type {msgtype} have no such frame")
     return full
 
 

@@ -48,7 +48,10 @@ def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
         if not path.exists():
             raise ValueError(f"{path}: no such file or folder")
         if path.is_dir() and not (path / "metadata.yaml").is_file():
-            raise ValueError(f"{path}: a folder of ROS 2 holds metadata.yaml, this one does not")
+            raise ValueError(
+                f"{path}: the folder of a ROS 2 bag must have a file metadata.yaml, this one has "
+                "none"
+            )
     # ROS 2 bags without definitions come from Humble or older.
     store = get_typestore(Stores.ROS2_HUMBLE)
     if messages is not None:
@@ -89,7 +92,7 @@ def _definitions(folder: Path) -> dict[str, Any]:
         with _rosbags(file):
             found |= get_types_from_msg(text, f"{package.name}/msg/{file.stem}")
     if not found:
-        raise ValueError(f"{folder}: must hold files PACKAGE/msg/NAME.msg, there are none")
+        raise ValueError(f"{folder}: must have files PACKAGE/msg/NAME.msg, has none")
     return found
 
 
@@ -119,8 +122,8 @@ def messages(reader: Any, topics: Sequence[str], advance: Advance) -> Iterator[b
         connection, time_ns, raw = item
         if connection.msgtype not in reader.typestore.types:
             raise ValueError(
-                f"{log_name(reader.paths)}, topic {connection.topic}: the log holds no definition "
-                f"of {connection.msgtype}, give the folder with its .msg files (--messages)"
+                f"{log_name(reader.paths)}, topic {connection.topic}: the log has no definition "
+                f"of the type {connection.msgtype}: give the folder of its .msg files (--messages)"
             )
         with _rosbags(reader.paths):
             message = reader.deserialize(raw, connection.msgtype)
@@ -152,7 +155,7 @@ class Values:
             time = self._time_path(received.message)
             self._unit = "ns" if time == "@bag" else table.get("time_unit", "s")
             if self._unit not in _TIME_UNITS:
-                raise ValueError(f"time_unit must be of {[*_TIME_UNITS]}, got {self._unit!r}")
+                raise ValueError(f"time_unit must be one of {[*_TIME_UNITS]}, got {self._unit!r}")
             self._getters = [_getter(path) for path in (time, *where, *(table[k] for k in keys))]
         self.messages += 1
         for stamp, *values in bag_fields.rows(received, self._getters):
@@ -202,8 +205,8 @@ class Values:
         lasts = np.ptp(stamps) * 1e-9
         if recorded and lasts and not 1 / _ODD < lasts / recorded < _ODD:
             raise ValueError(
-                f"times span {lasts:g} s, their recording {recorded:g} s: time_unit must be of "
-                f"{[*_TIME_UNITS]}, was {self._unit!r}"
+                f"times of the messages span {lasts:g} s, but the recording lasts {recorded:g} s: "
+                f"time_unit must be another one of {[*_TIME_UNITS]}, got {self._unit!r}"
             )
 
 

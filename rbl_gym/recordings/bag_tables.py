@@ -49,7 +49,7 @@ def make_tables(
     notes: list[str] = []
     times = np.array([time for time, _ in rows], dtype=np.int64)
     if back := int((np.diff(times) < 0).sum()):
-        notes.append(f"{kind}: {back} stamps came out of order, sorted")
+        notes.append(f"{kind}: {back} stamps were out of order, the messages were sorted")
     rows = [rows[i] for i in np.argsort(times, kind="stable")]
     if kind == "ranges":
         made = _ranges(rows, table)
@@ -61,7 +61,7 @@ def make_tables(
 def _ranges(rows: Sequence[Row], table: dict[str, Any]) -> Tables:
     unit = table.get("unit", "m")
     if unit not in UNITS:
-        raise ValueError(f"[ranges] unit must be of {[*UNITS]}, got {unit!r}")
+        raise ValueError(f"[ranges] unit must be one of {[*UNITS]}, got {unit!r}")
     dropped: Counter[str] = Counter()
     body = {str(tag) for tag in table.get("tags", ())}
     kept: dict[tuple[int, str, str], dict[str, Any]] = {}
@@ -87,8 +87,8 @@ def _ranges(rows: Sequence[Row], table: dict[str, Any]) -> Tables:
     tags = sorted({tag for _, _, tag in kept}, key=_natural)
     if both := [name for name in anchors if name in tags]:
         notes.append(
-            f"ranges: {', '.join(both)} stand at both ends: name the tags of the body, "
-            "--ranges tags=ID,ID"
+            f"ranges: {', '.join(both)} are used both as anchors and as tags: name the tags of "
+            "the body, --ranges tags=ID,ID"
         )
     if "anchor_position" in table:
         sheets |= _anchor_sheet(kept, anchors, notes)
@@ -115,7 +115,7 @@ def _link(
             values = {**values, "anchor_position": places[0], "tag_position": places[1]}
             anchor, tag = tag, anchor
         if tag not in body:
-            return (anchor, tag), values, "no tag of the body"
+            return (anchor, tag), values, "not a tag of the body"
     return (anchor, tag), values, None if anchor and tag else "no id"
 
 
@@ -168,14 +168,14 @@ def _anchor_sheet(
 ) -> dict[str, Sheet]:
     found = _places(kept, "anchor_position", 0)
     if missing := [name for name in anchors if name not in found]:
-        notes.append(f"anchors: the messages know no place of {', '.join(missing)}")
+        notes.append(f"anchors: the messages give no position of {', '.join(missing)}")
     if not found:
         return {}
     order = [name for name in anchors if name in found]
     if max(map(_spread, found.values())) <= _STANDS_M:
         rows = [(name, *np.median([p for _, p in found[name]], axis=0).tolist()) for name in order]
         return {"anchors.csv": Sheet(("anchor", "x", "y", "z"), rows)}
-    notes.append("anchors: they move, anchors.csv has a column t")
+    notes.append("anchors: they move, so anchors.csv has a column t")
     moving = {(time, name): place for name in order for time, place in found[name]}
     rows = [
         (seconds(time), name, *moving[time, name].tolist())
@@ -191,15 +191,16 @@ def _tag_sheet(
     for name, places in found.items():
         if (spread := _spread(places)) > _STANDS_M:
             raise ValueError(
-                f"[ranges] tag {name!r} stands at several places of the body, {spread:.3g} m "
-                "apart: `tag` must tell its antennas apart, as in tag={requester_id}.{antenna}"
+                f"[ranges] tag {name!r} has several positions on the body, {spread:.3g} m apart: "
+                "the path `tag` must distinguish its antennas, as in "
+                "tag={requester_id}.{antenna}"
             )
     middles = {name: np.median([p for _, p in found[name]], axis=0) for name in found}
     if not found or not any(place.any() for place in middles.values()):
-        notes.append("tags: the messages do not say where the tags stand on the body")
+        notes.append("tags: the messages do not give the positions of the tags on the body")
         return {}
     if missing := [name for name in tags if name not in found]:
-        notes.append(f"tags: the messages know no place of {', '.join(missing)}")
+        notes.append(f"tags: the messages give no position of {', '.join(missing)}")
     rows = [(name, *middles[name].tolist()) for name in tags if name in found]
     return {"tags.csv": Sheet(("tag", "x", "y", "z"), rows)}
 
@@ -230,12 +231,12 @@ def _motion(kind: str, rows: Sequence[Row], table: dict[str, Any], keep_constant
         norm = np.linalg.norm(quaternions, axis=1)
         if not keep_constant and len(given) > 1 and (given == given[0]).all():
             notes.append(
-                f"{kind}: the orientation never changes, only positions were written; "
-                "--truth orientation=PATH keeps it"
+                f"{kind}: the orientation never changes, so only positions were written; --truth "
+                "orientation=PATH writes it too"
             )
             columns = columns[:1]
         else:
-            _drop(keep, np.abs(norm - 1) > 0.01, "no unit quaternion", dropped)
+            _drop(keep, np.abs(norm - 1) > 0.01, "not a unit quaternion", dropped)
     header = ("t", *(name for _, names in columns for name in names))
     body = np.concatenate([blocks[key][keep] for key, _ in columns], axis=1)
     lines = [(seconds(time), *line) for time, line in zip(times[keep], body.tolist(), strict=True)]

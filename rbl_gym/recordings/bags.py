@@ -83,14 +83,16 @@ def convert_bag(
             kinds[kind] = _said(values, made, topics)
             if not len(made.times_ns) and (kind == "ranges" or kind in (mapping or {})):
                 dropped = [f"{n} dropped, {why}" for why, n in kinds[kind]["dropped"].items()]
-                raise ValueError(f"[{kind}] nothing is left: {'; '.join(dropped) or 'no message'}")
+                raise ValueError(
+                    f"[{kind}] no message can be used: {'; '.join(dropped) or 'there is none'}"
+                )
         notes += made.notes
         if values.by_recording:
-            notes.append(f"{kind}: the messages hold no stamps, times are those of recording")
+            notes.append(f"{kind}: the messages have no stamps, so the times of recording are used")
         if len(made.times_ns):
             sheets |= made.sheets
         else:
-            notes.append(f"{kind}: no message is left, no file was written")
+            notes.append(f"{kind}: no message can be used, so no file was written")
     notes += _far_stamps(kinds)
     if "ranges" in kinds:
         notes += [_to_write(name, kinds["ranges"]) for name in _POINTS if name not in sheets]
@@ -127,7 +129,9 @@ def show_message(log: Paths, topic: str, messages: AnyPath | None = None) -> lis
     """
     with bag_reading.opened(log, messages) as reader:
         if topic not in (topics := bag_reading.types(reader)):
-            raise ValueError(f"{log_name(log)}: no topic {topic!r}, there are {', '.join(topics)}")
+            raise ValueError(
+                f"{log_name(log)}: no topic {topic!r}, the topics are {', '.join(topics)}"
+            )
         for received in bag_reading.messages(reader, [topic], lambda steps: None):
             return bag_fields.describe(received.message)
     raise ValueError(f"{log_name(log)}: topic {topic} has no message")
@@ -147,9 +151,10 @@ def _check_ranges(
     if "ranges" in found or mapping.get("ranges", {}).get("topic") == "none":
         return
     raise ValueError(
-        "no topic is of a type of ranges that is known: name it and its fields, as in --ranges "
-        "topic=/uwb,anchor=responder_id,tag=requester_id,range=distance (or --ranges none); there "
-        f"are {', '.join(f'{topic} ({name})' for topic, name in topics.items()) or 'no topics'}"
+        "no topic has a known type of ranges: give the topic and its fields, as in --ranges "
+        "topic=/uwb,anchor=responder_id,tag=requester_id,range=distance (or --ranges none); "
+        "there are "
+        f"{', '.join(f'{topic} ({name})' for topic, name in topics.items()) or 'no topics'}"
     )
 
 
@@ -194,7 +199,10 @@ def _far_stamps(kinds: Mapping[str, Mapping[str, Any]]) -> list[str]:
     if not delays or max(delays.values()) - min(delays.values()) <= _FAR_S:
         return []
     told = ", ".join(f"{kind} {delay:.3f} s" for kind, delay in delays.items())
-    return [f"clocks differ, stamps are behind the recording by: {told}; time=@bag takes its time"]
+    return [
+        f"clocks differ, the stamps are behind the times of recording: {told}; time=@bag uses the "
+        "times of recording"
+    ]
 
 
 _POINTS = {"anchors.csv": "anchors", "tags.csv": "tags"}
@@ -203,7 +211,10 @@ _POINTS = {"anchors.csv": "anchors", "tags.csv": "tags"}
 def _to_write(name: str, said: Mapping[str, Any]) -> str:
     ids = ", ".join(said[_POINTS[name]])
     frame = "world frame" if name == "anchors.csv" else "body frame"
-    return f"{name} is yours to write: {_POINTS[name][:-1]},x,y,z in metres, {frame}, of {ids}"
+    return (
+        f"{name} cannot be written from the log. Write it with the columns "
+        f"{_POINTS[name][:-1]},x,y,z in metres, {frame}, for {ids}"
+    )
 
 
 def _write(out: Path, sheets: Mapping[str, Sheet]) -> dict[str, str]:
@@ -211,8 +222,8 @@ def _write(out: Path, sheets: Mapping[str, Sheet]) -> dict[str, str]:
     made = ("truth.csv", "imu.csv", "odometry.csv")
     if stale := [name for name in made if name not in sheets and (out / name).exists()]:
         raise ValueError(
-            f"{out / stale[0]} is there and does not come from this log: "
-            "remove it or choose another folder"
+            f"{out / stale[0]} exists and does not come from this log: remove it or choose "
+            "another folder"
         )
     out.mkdir(parents=True, exist_ok=True)
     for name, sheet in sheets.items():

@@ -29,7 +29,7 @@ def calibrated(
     table.check(corrected.max(axis=0)[link] <= MAX_RANGE_M, "bias_m", too_long)
     links = (ranges > 0) & (corrected > 0)
     if lost := int((ranges > 0).sum() - links.sum()):
-        said.drop("not positive once calibrated", lost)
-        said.note(table.path, f"{lost} ranges are not positive once calibrated and are left out")
+        said.drop("not positive after calibration", lost)
+        said.note(table.path, f"{lost} ranges are not positive after calibration and are left out")
     std = None if std is None else np.where(links, std / scale, 0.0)
     return np.where(links, corrected, 0.0), std

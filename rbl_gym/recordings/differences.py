@@ -40,7 +40,7 @@ def read_differences(
     """
     table.require("t", "anchor_a", "anchor_b", "difference")
     if anchors is None:
-        raise ValueError(f"{table.path}: differences need a table of anchors")
+        raise ValueError(f"{table.path}: time differences need a table of anchors")
     read = {"t", "anchor_a", "anchor_b", "difference", "tag", "run"}
     ids = anchors.ids, ids_of(table, "tag", tags)
     scale = scale_of(table, "difference", format, said)
@@ -148,7 +148,7 @@ def check_lengths(
     too_long = there & (high - low > 1.5 * extent + _NOISE_M)
     if too_long.sum() > _MOST_TOO_LONG * max(there.sum(), 1):
         raise ValueError(
-            f"{path}: units look inconsistent, ranges with an offset in common differ by "
-            f"{np.median((high - low)[too_long]):.4g} m and the points they are of are at most "
-            f"{extent.max():.4g} m apart (another unit? another kind of offset?)"
+            f"{path}: units look inconsistent, ranges with a common offset differ by "
+            f"{np.median((high - low)[too_long]):.4g} m, but the distances between their points "
+            f"are at most {extent.max():.4g} m (wrong unit? wrong kind of offset?)"
         )

@@ -52,7 +52,7 @@ def read_directions(
     table.check(whole, "harmonic", f"must be 1, 2, ... {_MOST}")
     harmonic = number.astype(int)
     row = (2 * at + at_tag) * (_MOST + 1) + harmonic
-    table.check(is_first(row), "harmonic", "must not come twice for one end and id")
+    table.check(is_first(row), "harmonic", "must be given once for each end and id")
     most = int(harmonic.max())
     fields = []
     for cos, sin in (_COLUMNS[3:5], _COLUMNS[5:7]):

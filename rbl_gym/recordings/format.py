@@ -81,8 +81,8 @@ class Format:
                 file = key.partition(".")[0] if "." in key else "ranges"
                 if file not in FILES or not value:
                     raise ValueError(
-                        f"{name} must be names by what they hold, of one of the files "
-                        f"{', '.join(FILES)}, got {key}={value}"
+                        f"{name} must map a quantity, or FILE.quantity with FILE one of "
+                        f"{', '.join(FILES)}, to a name; got {key}={value}"
                     )
 
     def of(self, file: str) -> Source:

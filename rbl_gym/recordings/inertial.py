@@ -65,14 +65,15 @@ def read_inertial(
     fastest = float(np.quantile(np.linalg.norm(readings[:, :3], axis=-1), 0.99))
     if fastest > _MAX_RATE:
         raise ValueError(
-            f"{table.path}: angular velocities of {fastest:.3g} rad/s, of a log in {turn_unit} "
-            "(looks like deg/s? say turn_unit='deg/s')"
+            f"{table.path}: angular velocities of {fastest:.3g} rad/s are too large for a log in "
+            f"{turn_unit} (if it is in deg/s, set turn_unit='deg/s')"
         )
     usual = float(np.median(np.linalg.norm(readings[:, 3:], axis=-1))) / GRAVITY_M_S2
     if not _FORCE[0] < usual < _FORCE[1]:
         raise ValueError(
-            f"{table.path}: the median specific force is {usual:.3g} g, of a log in {force_unit} "
-            f"(looks like {'g, or gravity was taken off' if usual < 1 else 'm/s^2'}?)"
+            f"{table.path}: the median specific force is {usual:.3g} g, which does not fit a log "
+            f"in {force_unit} (is it "
+            f"{'in g, or was gravity removed' if usual < 1 else 'in m/s^2'}?)"
         )
     return InertialLog(times, readings)
 
@@ -137,7 +138,7 @@ def samples_between(
     gap = max(float(np.diff(near).max(initial=0.0)), times[0] - start_s, end_s - times[-1])
     if gap > max_gap_s:
         raise ValueError(
-            f"log must have readings from {start_s:g} to {end_s:g} s, {gap:.3g} s of them are "
-            f"missing, more than max_gap_s = {max_gap_s:g}"
+            f"log must have readings from {start_s:g} to {end_s:g} s without gaps longer than "
+            f"max_gap_s = {max_gap_s:g}, got a gap of {gap:.3g} s"
         )
     return log.readings[first : last + 1], np.diff(edges)

@@ -35,18 +35,18 @@ _CAUSES = {
     "of an unknown anchor": ("unknown anchor", "anchor"),
     "of an unknown tag": ("unknown tag", "tag"),
     "to an unknown anchor": ("unknown anchor", "anchor_b"),
-    "of an anchor to itself": ("must be of two anchors", "anchor_b"),
+    "of an anchor to itself": ("must be another anchor than anchor_a", "anchor_b"),
     "twice with two values": ("each link may come once at a time", "range"),
     "of an anchor whose place is not known then": ("the anchor's place must be known", "t"),
 }
 _NAMES = [*_CAUSES]
 # Advice if one cause prevails.
 _HINTS = {
-    "too long": "ranges in another unit? say it",
-    "of an unknown anchor": "add it to the table of anchors",
-    "of an unknown tag": "add it to the table of tags",
+    "too long": "are the ranges in another unit? set it",
+    "of an unknown anchor": "add this anchor to the table of anchors",
+    "of an unknown tag": "add this tag to the table of tags",
     "twice with two values": "stamps too coarse, or several runs without a column run?",
-    "without a standard deviation": "another column of them? say which",
+    "without a standard deviation": "is it in another column? name that column",
     "of an anchor whose place is not known then": "do the clocks agree?",
 }
 _FINE = ("", "empty", "marked as not valid", "repeated")
@@ -201,11 +201,16 @@ def _links_of(
         for b, tag in enumerate(tags if "{tag}" in pattern else tags[:1]):
             name = pattern.replace("{anchor}", anchor).replace("{tag}", tag)
             if name in links:
-                raise ValueError(f"{table.path}: column {name!r} fits two pairs, use a long table")
+                raise ValueError(
+                    f"{table.path}: column {name!r} fits two links, use a table with columns t, "
+                    "anchor, tag, range"
+                )
             if name in table.columns:
                 links[name] = a, b
     if "{tag}" not in pattern and len(tags) > 1:
-        raise ValueError(f"columns {pattern!r} name no tag, and the tags are {tags!r:.200}")
+        raise ValueError(
+            f"columns {pattern!r} name no tag, but there are several tags: {tags!r:.200}"
+        )
     return links, (anchors, tags)
 
 
@@ -229,7 +234,7 @@ def scale_of(table: Table, column: str, format: Format, said: Said) -> float:
     """Return the length of a unit of the ranges in metres."""
     told = "" if format.unit else table.unit(column, METRES)
     if told in ("cm", "mm"):
-        said.note(table.path, f"ranges are in {told}, as the header tells")
+        said.note(table.path, f"ranges are in {told}, as the header states")
     return METRES.get(format.unit or told, 1.0)
 
 
@@ -280,9 +285,8 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         worst = max(bad, key=lambda cause: bad[cause])
         hint = f" ({_HINTS[worst]})" if worst in _HINTS else ""
         raise ValueError(
-            f"{table.path}: {count} of {total} ranges are no measurement: {causes}; a log with "
-            f"more than a fifth is refused{hint}. The first: "
-            f"{_first(measured, table, ids, refused)}"
+            f"{table.path}: {count} of {total} ranges cannot be used: {causes}; at most a fifth "
+            f"may be unusable{hint}. The first: {_first(measured, table, ids, refused)}"
         )
     if shown := {c: n for c, n in counts.items() if c not in ("", "empty", "marked as not valid")}:
         causes = ", ".join(f"{n} {cause}" for cause, n in shown.items())
@@ -301,7 +305,7 @@ def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str
     name = "anchor_a" if name == "anchor" and "anchor_a" in table.columns else name
     got = repr(table.columns[name][row])
     if column in ("anchor", "tag"):
-        must += f", must be of {ids[column == 'tag']!r:.200}"
+        must += f", must be one of {ids[column == 'tag']!r:.200}"
     if "once" in must:
         got = f"{got} of {ids[0][measured.anchor[at]]!r} and {ids[1][measured.tag[at]]!r} again"
     return f"{table.place(row, name)}: {must}, got {got:.80}"

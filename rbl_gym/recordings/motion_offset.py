@@ -82,7 +82,7 @@ def motion_offset(
         except ValueError as error:
             failed = failed or error
     if not found:
-        raise ValueError(f"no time offset by the motion: {failed}") from failed
+        raise ValueError(f"the motion does not determine a time offset: {failed}") from failed
     if len(found) == 1:
         return found[0]
     return _together(*found)

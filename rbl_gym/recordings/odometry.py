@@ -73,19 +73,21 @@ def read_odometry(
     else:
         readings, names = _of_axes(table, unit)
         if wheelbase_m is not None:
-            raise ValueError(f"{table.path}: wheelbase_m is of the columns left and right")
+            raise ValueError(
+                f"{table.path}: wheelbase_m must be left out without the columns left and right"
+            )
     said.read(table, ("t", *names))
     if (again := int((later == 0).sum())) > 0:
-        said.note(table.path, f"{again} rows whose time has come before are left out")
+        said.note(table.path, f"{again} rows that repeat a time are left out")
     most = np.nan_to_num(np.abs(readings)).max(axis=0)
     if most[:3].max() > _MAX_RATE:
         raise ValueError(
-            f"{table.path}: turn rates of {most[:3].max():.3g} rad/s (looks like deg/s, or a "
-            "width in other units?)"
+            f"{table.path}: turn rates of {most[:3].max():.3g} rad/s are too large (in deg/s, or "
+            "wheelbase in another unit?)"
         )
     if most[3:].max() > _MAX_SPEED:
         raise ValueError(
-            f"{table.path}: speeds of {most[3:].max():.3g} m/s (looks like millimetres?)"
+            f"{table.path}: speeds of {most[3:].max():.3g} m/s are too large (in millimetres?)"
         )
     return OdometryLog(times[later > 0], readings[later > 0])
 
@@ -95,8 +97,8 @@ def _of_axes(table: Table, unit: float) -> tuple[FloatArray, tuple[str, ...]]:
     if not names:
         raise ValueError(
             f"{table.path}, line {table.header_line}: must have some of the columns "
-            f"{', '.join(_COLUMNS)}, or left and right, got {[*table.names.values()]!r:.200}; say "
-            "which they are by columns, odometry.vx=NAME"
+            f"{', '.join(_COLUMNS)}, or left and right, got {[*table.names.values()]!r:.200}; "
+            "name them by columns, as in odometry.vx=NAME"
         )
     readings = np.full((len(table.lines), 6), np.nan)
     for name in names:

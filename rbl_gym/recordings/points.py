@@ -74,7 +74,7 @@ def read_points(path: AnyPath, kind: str, source: Source, said: Said) -> Points:
         rows = rows[np.argsort(times[rows], kind="stable")]
         again = np.ones(len(times), dtype=bool)
         again[rows[1:]] = np.diff(times[rows]) > 0
-        table.check(again, "t", f"{kind} {name!r} may have one place at a time")
+        table.check(again, "t", f"{kind} {name!r} must have one position at a time")
         tracks.append((times[rows], places[rows]))
     said.note(table.path, _longest_gap(names, tracks))
     return moving(names, tuple(tracks))
@@ -88,8 +88,8 @@ def _longest_gap(ids: tuple[str, ...], tracks: list[tuple[FloatArray, FloatArray
     if gap <= _GAP * usual:
         return ""
     return (
-        f"{ids[worst]!r} has no place for {gap:.4g} s (usually {usual:.4g} s); it is taken to move "
-        "straight meanwhile"
+        f"{ids[worst]!r} has no position for {gap:.4g} s (usually {usual:.4g} s); straight motion "
+        "is assumed there"
     )
 
 

@@ -60,7 +60,7 @@ def read_log(
     if "difference" in table.columns:
         if format.offset not in (None, "tag"):
             raise ValueError(
-                f"{table.path}: differences have the offset of their tag, got offset "
+                f"{table.path}: offset must be None or 'tag' for time differences, got "
                 f"{format.offset!r}"
             )
         measured, other, ids = read_differences(table, anchors, tags, format, said)
@@ -93,8 +93,12 @@ def read_log(
     if other is not None:
         ranges, links, std, lost = pseudo_ranges(measured, other, epoch, shape)
         if lost:
-            said.drop("of anchors that hang together with no other", lost)
-            said.note(table.path, f"{lost} differences hang together with none of the others")
+            said.drop("of anchors without a connection to the others", lost)
+            said.note(
+                table.path,
+                f"{lost} time differences are left out, as their anchors have no connection to "
+                "the others",
+            )
         return _leveled(Log(epochs, ranges, links, std, anchors, places, tags, "tag"), table)
     cells = epoch[used], measured.anchor[used], measured.tag[used]
     ranges, links = np.zeros(shape), np.zeros(shape, dtype=np.bool_)
@@ -122,8 +126,8 @@ def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, s
     table.check(
         late <= allowed + 1e-9,
         "t",
-        f"time must not fall by more than {allowed:g} s from row to row (several runs in one file? "
-        "they need a column run; another unit? say the time unit)",
+        f"time must not fall by more than {allowed:g} s from row to row (several runs in one file "
+        "need a column run; or set the time unit)",
     )
     if count := int((late > 0).sum()):
         said.sorted_rows += count

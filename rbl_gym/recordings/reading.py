@@ -131,8 +131,8 @@ def read_recording(
     runs = _runs_of(table)
     if run is None and len(runs) > 1:
         raise ValueError(
-            f"{table.path}: has {len(runs)} runs, {[*runs]!r:.200}; read one of them by run, or "
-            "all by read_runs"
+            f"{table.path}: has {len(runs)} runs, {[*runs]!r:.200}; choose one with run, or read "
+            "all with read_runs"
         )
     if run is not None:
         if run not in runs:
@@ -197,7 +197,9 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
     if files.calibration is not None:
         biases = read_table(files.calibration, format.of("calibration"))
         if log.offset is not None:
-            raise ValueError("calibration is of ranges, and these have an unknown offset in common")
+            raise ValueError(
+                "calibration must be left out for ranges with an unknown common offset"
+            )
         ranges, std = calibrated(log.ranges, log.range_std, biases, ids, said)
         log = log._replace(ranges=ranges, links=ranges > 0, range_std=std)
     places = log.anchors.places if log.anchors.tracks is None else log.anchor_places
@@ -235,7 +237,7 @@ def _inertial(files: _Files, format: Format) -> InertialLog | None:
     """Return the readings of the inertial sensor in body axes."""
     if files.imu is None:
         if files.imu_frame is not None:
-            raise ValueError("imu_frame means nothing without imu")
+            raise ValueError("imu_frame needs imu")
         return None
     columns = dict(format.of("imu").columns)
     log = read_inertial(files.imu, columns=columns, turn_unit=format.turn_unit)
@@ -276,11 +278,11 @@ def _frame_at(
     """Return rotation and translation of the carrier (K, ...), and a mask of known poses."""
     rotation, translation, known = truth_at(carrier, times, _CARRIER_GAP_S)
     if rotation is None:
-        raise ValueError(f"{path}: a carrier needs rotations, got positions alone")
+        raise ValueError(f"{path}: the poses of a carrier must have rotations, got only positions")
     if not known.any():
         spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (times, carrier.times)]
         raise ValueError(
-            f"{path}: the carrier's pose is known at no time wanted: those are {spans[0]}, its "
-            f"poses {spans[1]}"
+            f"{path}: the carrier has no pose at any time of the ranges: ranges {spans[0]}, poses "
+            f"{spans[1]}"
         )
     return rotation, translation, known

@@ -70,5 +70,5 @@ class Said:
             named = [name for name in names if not name.startswith("(column")]
             if named:
                 some = ", ".join(sorted(named)[:8]) + (", ..." if len(named) > 8 else "")
-                notes.append(f"{path}: columns that are not read: {some}.")
+                notes.append(f"{path}: columns not read: {some}.")
         return Report(self.ranges, dict(self.dropped), self.sorted_rows, tuple(notes))

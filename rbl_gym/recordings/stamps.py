@@ -71,8 +71,8 @@ def found_unit(stamps: FloatArray) -> tuple[str, str]:
         if len(distinct) >= _MANY and (distinct == np.round(distinct)).all():
             return "ms", _words("ms", step)
         return "s", (
-            f"times are {step:.6g} apart (median) and are taken for seconds; say the time unit ms "
-            "if they are milliseconds"
+            f"times are {step:.6g} apart (median) and are read as seconds; set the time unit to "
+            "ms if they are milliseconds"
         )
     return unit, _words(unit, step)
 
@@ -81,8 +81,8 @@ def _words(unit: str, step: float) -> str:
     if unit == "s":
         return ""
     return (
-        f"times are taken for {_WORDS[unit]}, they are {step:.6g} apart (median); "
-        "a time unit that is said counts instead"
+        f"times are read as {_WORDS[unit]}, as they are {step:.6g} apart (median); set the time "
+        "unit if this is wrong"
     )
 
 

@@ -92,7 +92,7 @@ class Table(NamedTuple):
         )
         if self.source.file:
             names = self.source.given(**dict.fromkeys(missing, "NAME"))
-            text += f"; say which it is by columns, --columns {names}"
+            text += f"; name it by columns, --columns {names}"
         raise ValueError(text)
 
     def name(self, column: str) -> str:
@@ -205,10 +205,10 @@ class Table(NamedTuple):
         found = []
         for column, known in zip(("anchor", "tag"), ids, strict=True):
             found.append(self.positions(column, known))
-            self.check(found[-1] >= 0, column, f"unknown {column}, must be of {known!r:.200}")
+            self.check(found[-1] >= 0, column, f"unknown {column}, must be one of {known!r:.200}")
         pairs = [*zip(self.columns["anchor"], self.columns["tag"], strict=True)]
         once = is_first(found[0] * len(ids[1]) + found[1])
-        self.check(once, "tag", "each link may come once in the table", got=pairs)
+        self.check(once, "tag", "each link must be in the table once", got=pairs)
         return found[0], found[1]
 
 
@@ -242,7 +242,9 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
     rows = np.ones(len(cells.lines), dtype=bool)
     for column, want in source.where.items():
         if (name := names.get(column, column)) not in by_name:
-            raise ValueError(f"{where}: no column {column!r} to choose by, got {header!r:.200}")
+            raise ValueError(
+                f"{where}: no column {column!r} to choose rows by, got {header!r:.200}"
+            )
         rows &= np.array([cell.strip() == want for cell in by_name[name]])
         if not rows.any():
             got = sorted({cell.strip() for cell in by_name[name]})
@@ -290,19 +292,21 @@ def _roles(
     if pattern is not None:
         before, star, after = pattern.partition("*")
         if not star:
-            raise ValueError(f"{where}: columns must name * by what has a *, got {pattern!r}")
+            raise ValueError(f"{where}: a column named * needs a pattern with a *, got {pattern!r}")
         for name in header:
             if name.startswith(before) and name.endswith(after) and len(name) > len(pattern) - 1:
                 names[name[len(before) : len(name) - len(after)]] = name
         if not names:
-            raise ValueError(f"{where}: no column is like {pattern!r}, got {header!r:.200}")
+            raise ValueError(f"{where}: no column fits {pattern!r}, got {header!r:.200}")
     for role, name in columns.items():
         if "{" in name:
             continue  # a pattern of links
         if name not in header:
             if role in header and role not in _QUANTITIES and name in _QUANTITIES:
                 swapped = source.given(**{name: role})
-                raise ValueError(f"{where}: {role!r} is no quantity; did you mean {swapped}?")
+                raise ValueError(
+                    f"{where}: {role!r} is not a known quantity; did you mean {swapped}?"
+                )
             raise ValueError(f"{where}: missing column {name!r} for {role}, got {header!r:.200}")
         names[role] = name
     taken = set(names.values())

@@ -134,7 +134,7 @@ def _check_decimals(path: str, rows: list[list[str]], numbers: list[int]) -> Non
         for i in pointed:
             if "," in row[i]:
                 raise ValueError(
-                    f"{path}, line {line}: must have points or commas as decimal points, got "
+                    f"{path}, line {line}: must not mix points and commas as decimal points, got "
                     f"{row[i]!r:.80} in a column with points"
                 )
 

@@ -99,8 +99,8 @@ def time_offset(
     a, b = _checked("a", times_a, values_a), _checked("b", times_b, values_b)
     if a[1].shape[1] != b[1].shape[1]:
         raise ValueError(
-            f"values_a and values_b must have as many columns, got {a[1].shape[1]} "
-            f"and {b[1].shape[1]}"
+            f"values_a and values_b must have the same number of columns, got {a[1].shape[1]} and "
+            f"{b[1].shape[1]}"
         )
     coarsest = max(float(np.median(np.diff(times))) for times, _ in (a, b))
     search = np.inf if search_s is None else check_number("search_s", search_s, low=0.0)
@@ -188,7 +188,7 @@ def _coarse(a: _Signal, b: _Signal, step: float, search: float) -> tuple[float, 
     tried = shared & (np.abs(offsets) <= search + 1e-9)
     if not tried.any():
         raise ValueError(
-            "signals have too little time in common at any offset"
+            "signals overlap too little at all offsets"
             + ("" if np.isinf(search) else f" of up to {search:g} s")
         )
     cross, power_a, power_b = (np.zeros(len(common)) for _ in range(3))
@@ -211,8 +211,7 @@ def _coarse(a: _Signal, b: _Signal, step: float, search: float) -> tuple[float, 
     ends = np.flatnonzero(tried)[[0, -1]]
     if best in ends and ends[0] != ends[1]:
         raise ValueError(
-            f"signals agree best at the end of what is searched, {offsets[best]:.4g} s: "
-            "search further"
+            f"signals agree best at the end of the search, {offsets[best]:.4g} s: increase search_s"
         )
     _check_rivals(offsets, correlation, best)
     return float(offsets[best]), float(correlation[best])
@@ -235,7 +234,7 @@ def _check_rivals(offsets: FloatArray, correlation: FloatArray, best: int) -> No
         raise ValueError(
             f"signals agree as well at an offset of {offsets[rival]:.4g} s as at "
             f"{offsets[best]:.4g} s (correlations {correlation[rival]:.3f} and "
-            f"{correlation[best]:.3f}): search less far, or give the offset"
+            f"{correlation[best]:.3f}): decrease search_s, or give the offset"
         )
 
 

@@ -161,8 +161,8 @@ def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
             columns[axis] = names[0]
         elif angle in table.columns or names:
             raise ValueError(
-                f"{table.path}, line {table.header_line}: column {angle!r} must tell its unit: "
-                f"call it {angle}_deg or {angle}_rad (by columns, {angle}_deg=NAME), got "
+                f"{table.path}, line {table.header_line}: column {angle!r} must state its unit: "
+                f"name it {angle}_deg or {angle}_rad (by columns, {angle}_deg=NAME), got "
                 f"{[*table.names.values()]!r:.200}"
             )
     if not columns:

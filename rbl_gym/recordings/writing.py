@@ -57,7 +57,8 @@ def check_track_path(path: AnyPath) -> None:
     """Raise ValueError unless the file suffix is ``.tum``, ``.txt`` or ``.csv``."""
     if Path(path).suffix.lower() not in _TUM + _CSV:
         raise ValueError(
-            f"{os.fspath(path)}: a track must end in .tum or .txt (TUM) or in .csv, with covariance"
+            f"{os.fspath(path)}: the name of a track must end in .tum or .txt (TUM format), or in "
+            ".csv (with covariance)"
         )
 
 
@@ -127,7 +128,7 @@ def read_track(path: AnyPath) -> TrackFile:
     """
     truth = read_truth(path)
     if truth.rotation is None:
-        raise ValueError(f"{os.fspath(path)}: a track needs rotations, got positions alone")
+        raise ValueError(f"{os.fspath(path)}: a track must have rotations, got only positions")
     track = TrackFile(truth.times, truth.rotation, truth.translation)
     if Path(path).suffix.lower() not in _CSV:
         return track

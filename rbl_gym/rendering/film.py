@@ -65,7 +65,7 @@ class Film:
         with a known belief.
         """
         if not self._taken:
-            raise gym.error.ResetNeeded("nothing to render yet: call reset()")
+            raise gym.error.ResetNeeded("there is nothing to render yet: call reset() first")
         episode: list[tuple[int, Any, Any]] = []
         for epochs, shot, belief in reversed(self._taken):
             at = int(epochs[world])

@@ -77,7 +77,9 @@ class _World:
         from matplotlib.lines import Line2D
 
         handles = [
-            Line2D([], [], color=ANCHOR, marker="^", ms=7, ls="", label="anchor (hollow: silent)"),
+            Line2D(
+                [], [], color=ANCHOR, marker="^", ms=7, ls="", label="anchor (hollow: no range)"
+            ),
             Line2D([], [], color=ANCHOR, lw=0.8, alpha=0.6, label="measures"),
             Line2D([], [], color=INK, marker="o", ms=4.5, ls="", label="body, its axes enlarged"),
             Line2D([], [], color="#495057", lw=1.3, label="path, its shadow"),

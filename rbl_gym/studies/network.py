@@ -72,8 +72,8 @@ def _solved(path: str, graph: PoseGraph, weights: str) -> Solved:
             graphs.check_connected(edges, n_nodes, graph.ids)
         except ValueError as error:
             raise ValueError(
-                f"of those with information of theta (I33): {error}; "
-                "--weights unit takes all edges alike"
+                f"among the edges with information of theta (I33): {error}; --weights unit gives "
+                "all edges the same weight"
             ) from error
     begin = time.perf_counter()
     theta = estimators.orientations(edges, y, n_nodes, weights=w)
@@ -135,8 +135,8 @@ def edge_weights(graph: PoseGraph) -> FloatArray:
     if needed.any():
         i, j = graph.ids[graph.edges[np.argmax(needed)]]
         raise ValueError(
-            f"every edge on a cycle must have information (I11 to I33), got none in "
-            f"edge {i} {j}; --weights unit takes all edges alike"
+            f"every edge on a cycle must have information (I11 to I33), got none in edge {i} {j}; "
+            "--weights unit gives all edges the same weight"
         )
     return np.where(missing, np.nanmax(weight) or 1.0, weight)
 
@@ -149,9 +149,9 @@ def _on_cycles(edges: IntArray, n_nodes: int) -> np.ndarray:
 
 def _said(graph: PoseGraph, weights: str) -> str:
     if weights == "unit":
-        return "all edges alike, as asked for"
+        return "equal for all edges, as asked for"
     if graph.information is None:
-        return "all edges alike: the file has no information"
+        return "equal for all edges, as the file has no information"
     return "information of theta"
 
 

@@ -169,7 +169,7 @@ def _track_bound(
         )
         J = with_epoch(J, information_of(epoch, nuisances, share), law.states)
         if not np.isfinite(J).all():
-            raise ValueError(f"scene {scene.name!r} has ranges that do not determine the pose")
+            raise ValueError(f"the ranges of scene {scene.name!r} do not determine the pose")
         P = np.linalg.inv(J)[..., :6, :6]
         variance.append(np.diagonal(P, axis1=-2, axis2=-1))
         b.append(bounds.score(P, at.rotation, scene.body))

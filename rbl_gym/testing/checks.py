@@ -122,7 +122,7 @@ def _filter_interface(make_filter: Any, rng: np.random.Generator) -> None:
     for name in ("initial", "predict", "update", "belief"):
         require(
             callable(getattr(filter, name, None)),
-            f"a filter must have the method {name!r}, {type(filter).__name__} has none",
+            f"a filter must have the method {name!r}, but {type(filter).__name__} has not",
         )
 
 
@@ -146,12 +146,12 @@ def _filter_batching(make_filter: Any, rng: np.random.Generator) -> None:
     for index in range(4):
         alone = _beliefs(filter, trial(epochs, index))[-1]
         check_same(
-            f"a batch must give what its trials give alone; of trial {index}",
+            f"a batch must give the same as each trial alone; trial {index}",
             take(together, index), alone,
         )  # fmt: skip
     each = np.broadcast_to(ANCHORS, (4, *ANCHORS.shape)).copy()
     apart = _beliefs(filter, epochs, anchors=each)[-1]
-    check_same("anchors (M, 3) must mean the same as (B, M, 3) alike", together, apart)
+    check_same("anchors (M, 3) must give the same as (B, M, 3) with equal entries", together, apart)
 
 
 def _filter_purity(make_filter: Any, rng: np.random.Generator) -> None:
@@ -170,7 +170,10 @@ def _filter_determinism(make_filter: Any, rng: np.random.Generator) -> None:
     filter = _made(make_filter)
     epochs = _drawn(filter, rng, (3,), 3)
     first = _beliefs(filter, epochs)[-1]
-    for label, other in (("a second run", filter), ("a filter made alike", _made(make_filter))):
+    for label, other in (
+        ("a second run", filter),
+        ("a second filter with the same arguments", _made(make_filter)),
+    ):
         check_same(f"{label} must give the same bytes", first, _beliefs(other, epochs)[-1], 0.0)
 
 
@@ -183,11 +186,11 @@ def _filter_pickling(make_filter: Any, rng: np.random.Generator) -> None:
         try:
             copies.append(pickle.loads(pickle.dumps(thing)))
         except Exception as error:
-            raise AssertionError(f"the {label} must pickle, raised {error!r}") from error
+            raise AssertionError(f"the {label} must be picklable, raised {error!r}") from error
     copy, copied = copies
     after = filter.belief(filter.update(state, epochs.ranges[0], ANCHORS))
     again = copy.belief(copy.update(copied, epochs.ranges[0], ANCHORS))
-    check_same("a filter and a state out of a pickle must give the same bytes", after, again, 0.0)
+    check_same("an unpickled filter and state must give the same bytes", after, again, 0.0)
 
 
 def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
@@ -204,7 +207,9 @@ def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
     )
     expected = moved(_beliefs(filter, epochs)[-1], turn, shift)
     found = _beliefs(filter, elsewhere, anchors=ANCHORS @ turn.T + shift)[-1]
-    check_same("a world moved and turned must move and turn the belief", expected, found)
+    check_same(
+        "moving and turning the world must move and turn the belief by as much", expected, found
+    )
 
 
 def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
@@ -220,7 +225,7 @@ def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
     check_links(update, ranges)
     nothing = update(np.zeros_like(ranges), anchors, ~full)
     before = filter.belief(state)
-    check_same("an epoch without a link must leave the belief as it was", before, nothing)
+    check_same("an epoch without links must not change the belief", before, nothing)
 
 
 def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
@@ -236,18 +241,18 @@ def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
         return filter.belief(call(name, update, state, epochs.ranges[0], ANCHORS, links))
 
     own = filter.belief(filter.update(state, epochs.ranges[0], ANCHORS, links))
-    check_same("noise None must mean the law that the filter was made with",
+    check_same("update(..., noise=None) must use the law with which the filter was made",
                own, belief(filter, state))  # fmt: skip
     each = ranging.LinkNoise(NOISE.floor_m * rng.uniform(0.5, 3.0, epochs.ranges.shape[1:]))
     for law in (ranging.RangeNoise(3 * NOISE.floor_m), each):
         other = _made(make_filter, law)
         twin = call("initial", other.initial, *epochs.prior)
         check_same(
-            f"update(..., noise=law) must give what a filter made with that {type(law).__name__} "
-            "gives",
+            "update(..., noise=law) must give the same as a filter made with this "
+            f"{type(law).__name__}",
             belief(other, twin), belief(filter, state, law),
         )  # fmt: skip
-    check_same("the noise of one update must not stay for the next",
+    check_same("the noise of one update must not be used in the next",
                own, belief(filter, state))  # fmt: skip
 
 
@@ -282,8 +287,8 @@ def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
     prior = metrics.tag_error(*epochs.prior[:2], *first)
     require(
         np.median(found) < np.median(prior),
-        f"after {_EPOCHS} epochs the tags must be nearer to the truth than before the first, got "
-        f"{np.median(found):.3g} m, of the prior {np.median(prior):.3g} m",
+        f"after {_EPOCHS} epochs the median tag error must be smaller than that of the prior, got "
+        f"{np.median(found):.3g} m and {np.median(prior):.3g} m for the prior",
     )
 
 
@@ -332,7 +337,7 @@ def _locator_batching(locate: Any, rng: np.random.Generator) -> None:
     together = _located(locate, ranges)
     for index in range(4):
         check_same(
-            f"a batch must give what its trials give alone; of trial {index}",
+            f"a batch must give the same as each trial alone; trial {index}",
             take(together, index), _located(locate, ranges[index]),
         )  # fmt: skip
 
@@ -355,7 +360,9 @@ def _locator_invariance(locate: Any, rng: np.random.Generator) -> None:
     turn, shift = moved_world(rng)
     expected = moved(_located(locate, ranges), turn, shift)
     found = _located(locate, ranges, ANCHORS @ turn.T + shift)
-    check_same("a world moved and turned must move and turn the estimate", expected, found)
+    check_same(
+        "moving and turning the world must move and turn the estimate by as much", expected, found
+    )
 
 
 def _locator_links(locate: Any, rng: np.random.Generator) -> None:

@@ -102,7 +102,7 @@ def call(name: str, function: Callable[..., Any], *arguments: Any, **options: An
     except Exception as error:
         shapes = ", ".join(str(np.shape(a)) for a in arguments if isinstance(a, np.ndarray))
         raise AssertionError(
-            f"{name} must take arguments that are right, raised {error!r}"
+            f"{name} must accept valid arguments, raised {error!r}"
             + (f" on shapes {shapes}" if shapes else "")
         ) from error
 
@@ -155,12 +155,18 @@ def check_pose(name: str, pose: Any) -> None:
     Q, P = np.asarray(pose.rotation), np.asarray(pose.covariance)
     require(np.isfinite(Q).all(), f"{name}.rotation must be finite, got {Q}")
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max()
-    require(defect < _SAME, f"{name}.rotation must be orthogonal, Q Q^T is off I by {defect:.3g}")
+    require(
+        defect < _SAME,
+        f"{name}.rotation must be orthogonal, but Q Q^T differs from I by {defect:.3g}",
+    )
     worst = np.linalg.det(Q).min()
     require(worst > 0, f"{name}.rotation must be proper, got a reflection (det {worst:.3g})")
     require(np.isfinite(P).all(), f"{name}.covariance must be finite, got {P}")
     skew = np.abs(P - np.swapaxes(P, -1, -2)).max() / np.abs(P).max()
-    require(skew < _SAME, f"{name}.covariance must be symmetric, is off by {skew:.3g} of itself")
+    require(
+        skew < _SAME,
+        f"{name}.covariance must be symmetric, but its relative asymmetry is {skew:.3g}",
+    )
     least = np.linalg.eigvalsh(P).min()
     require(least > 0, f"{name}.covariance must be positive definite, least eigenvalue {least:.3g}")
 
@@ -174,7 +180,7 @@ def check_same(rule: str, expected: Any, found: Any, tolerance: float = _SAME) -
         require(got.shape == want.shape, f"{rule}: {field} has shape {got.shape}, not {want.shape}")
         scale = np.abs(want).max() if field == "covariance" else 1.0
         gap = np.abs(got - want).max(initial=0.0) / scale
-        require(gap <= tolerance, f"{rule}: {field} is off by {gap:.3g}")
+        require(gap <= tolerance, f"{rule}: {field} differs by {gap:.3g}")
 
 
 def check_pure(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -183,7 +189,8 @@ def check_pure(name: str, function: Callable[..., Any], *arguments: Any, **optio
     result = call(name, function, *arguments, **options)
     for k, (value, old) in enumerate(zip((*arguments, *options.values()), before, strict=True)):
         require(
-            pickle.dumps(value) == old, f"{name} must not change its arguments, changed no. {k}"
+            pickle.dumps(value) == old,
+            f"{name} must not change its arguments, but changed argument {k}",
         )
     return result
 
@@ -192,14 +199,17 @@ def check_links(estimate: Callable[[FloatArray, FloatArray, Any], Any], ranges: 
     """Check that `estimate` (ranges, anchors, links) gives no weight to a link that is False."""
     full = np.ones(ranges.shape, dtype=np.bool_)
     plain = estimate(ranges, ANCHORS, None)
-    check_same("links all True must mean the same as none", plain, estimate(ranges, ANCHORS, full))
+    check_same(
+        "links all True must give the same as links=None", plain, estimate(ranges, ANCHORS, full)
+    )
     links = full.copy()
     links[..., 2, :] = False
     without = estimate(np.delete(ranges, 2, axis=-2), np.delete(ANCHORS, 2, axis=0), None)
     for value in (0.0, 7.0, 1e3):
         behind = np.where(links, ranges, value)
         check_same(
-            f"an anchor without a link, {value:g} in its place, must count like no anchor",
+            f"an anchor whose links are all False must have no influence, even with {value:g} as "
+            "its ranges",
             without, estimate(behind, ANCHORS, links),
         )  # fmt: skip
 
@@ -232,6 +242,7 @@ def check_nees(poses: Sequence[Any], rotation: FloatArray, translation: FloatArr
     low, high = _NEES
     require(
         low <= average <= high,
-        f"beliefs must be honest, NEES per degree of freedom between {low:.2g} and {high:.2g}, "
-        f"got {average:.3g}: errors are {'larger' if average > high else 'smaller'} than claimed",
+        f"beliefs must be consistent, with NEES per degree of freedom between {low:.2g} and "
+        f"{high:.2g}, got {average:.3g}: errors are {'larger' if average > high else 'smaller'} "
+        "than claimed",
     )

@@ -47,15 +47,15 @@ class SceneFamily:
         for scene in self.corners:
             if scene.inertial is not None:
                 raise ValueError(
-                    "scenes must have no inertial sensor: its readings have a shape of their own "
-                    f"in every scene, got one in {scene.name!r}"
+                    "scenes must have no inertial sensor, as the shape of its readings differs "
+                    f"between scenes; got one in {scene.name!r}"
                 )
             first = self.corners[0]
             alike = scene.prisms == first.prisms and scene.gain == first.gain
             if not alike or (scene.gain and scene.anchor_region != first.anchor_region):
                 raise ValueError(
-                    "scenes of building files with walls, or limits of range and view, must all be "
-                    f"of one file, got {scene.name!r} beside {first.name!r}"
+                    "scenes of building files that have walls, or limits of range or view, must "
+                    f"all come from one file, got {scene.name!r} beside {first.name!r}"
                 )
             if scene.links.offset is not None:
                 raise ValueError(

@@ -36,7 +36,9 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
     values = {}
     for key, value in changes.items():
         if key not in fields:
-            raise ValueError(f"{path} has no field {key!r}; it has {', '.join(sorted(fields))}")
+            raise ValueError(
+                f"{path} has no field {key!r}; its fields are {', '.join(sorted(fields))}"
+            )
         old = getattr(base, key)
         if key in _READ_BY_THEMSELVES:
             values[key] = value
@@ -57,10 +59,12 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
     kinds = next((k for k in (REGIONS, NOISE_LAWS) if isinstance(old, tuple(k.values()))), unset)
     if "kind" not in value:
         if not dataclasses.is_dataclass(old):
-            raise ValueError(f"{path} is not a nested field, got a dict {dict(value)!r:.80}")
+            raise ValueError(
+                f"{path} must be a value, not a dict of fields, got {dict(value)!r:.80}"
+            )
         return replace(old, value, path)
     if not kinds:
-        raise ValueError(f"{path} comes in one kind only, got kind {value['kind']!r}")
+        raise ValueError(f"{path} has only one kind, so leave out kind; got {value['kind']!r}")
     forms = NOISE_FORMS if kinds is NOISE_LAWS else kinds
     kind = forms[check_one_of(f"{path}.kind", value["kind"], list(forms))]
     try:

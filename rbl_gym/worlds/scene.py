@@ -171,7 +171,7 @@ class Scene:
         check_number("dt", self.dt, low=1e-9)
         if self.process.std().ndim > 1:
             shape = self.process.std().shape[:-1]
-            raise ValueError(f"process must be that of all worlds, got leading axes {shape}")
+            raise ValueError(f"process must be the same for all worlds, got leading axes {shape}")
         for name in ("initial_rotation_rad", "initial_translation_m"):
             check_number(name, getattr(self, name), low=1e-9)
         for name in ("anchor_speed_m_s", "speed_m_s", "spin_rad_s", "survey_std_m"):
@@ -202,14 +202,14 @@ class Scene:
             object.__setattr__(self, "start_rotation", as_tuples(value))
         if self.anchors is not None and len(self.anchors) != self.n_anchors:
             raise ValueError(
-                f"anchors must hold n_anchors = {self.n_anchors} places, got {len(self.anchors)}"
+                f"anchors must hold n_anchors = {self.n_anchors} positions, got {len(self.anchors)}"
             )
         if self.fixed:
             fixed = check_array("fixed", self.fixed, ("F", 3))
             if self.anchors is not None or fixed.ndim != 2 or len(fixed) > self.n_anchors:
                 raise ValueError(
-                    f"fixed must be places of at most n_anchors = {self.n_anchors} anchors, and "
-                    f"anchors None, got {self.fixed!r:.80}"
+                    f"fixed must hold positions of at most n_anchors = {self.n_anchors} anchors, "
+                    f"and needs anchors=None; got {self.fixed!r:.80}"
                 )
             object.__setattr__(self, "fixed", as_tuples(fixed))
         else:
@@ -224,11 +224,14 @@ class Scene:
             moved = np.abs(self.anchor_region.project(np.array(self.anchors)) - self.anchors)
             if moved.max() > 1e-6:
                 raise ValueError(
-                    f"anchors that move must start in their region, got one {moved.max():g} m off"
+                    f"anchors that move must start in their region, got one {moved.max():g} m "
+                    "outside"
                 )
         reference = getattr(self.noise, "reference_tag", None)
         if reference is not None and not 0 <= reference < len(self.tags):
-            raise ValueError(f"reference_tag must be below {len(self.tags)} tags, got {reference}")
+            raise ValueError(
+                f"reference_tag must be below the number of tags, {len(self.tags)}, got {reference}"
+            )
 
     def _check_trajectory(self) -> None:
         """Check the trajectory: orbit and lawn-mower define their start and need a volume."""

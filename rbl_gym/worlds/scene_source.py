@@ -38,7 +38,7 @@ def read_scenes(path: str | Path) -> Any:
                 f"got {scene!r:.80}"
             )
     if not found:
-        raise ValueError(f"{path} holds no scenes")
+        raise ValueError(f"{path} must hold at least one scene, got none")
     return found
 
 

@@ -228,7 +228,7 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     base = _named(scene["name"])
     if "layout" in scene:
         if "anchors" in changes:
-            raise ValueError("scene must have either anchors or a layout, got both")
+            raise ValueError("scene must have either anchors or layout, got both")
         changes["anchors"] = as_tuples(_entry_point(READERS[".csv"])(scene["layout"]).positions)
     if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
         changes.setdefault("anchors", None)

@@ -323,7 +323,9 @@ def measure_epoch(
     if scene.links.offset is None:
         return measured
     if at.offsets is None:
-        raise ValueError("links.offset is for episodes of a scene, and these are none")
+        raise ValueError(
+            "links.offset must be None here: offsets are drawn only in episodes of a scene"
+        )
     return ranging.with_offsets(measured, scene.links, at.offsets)
 
 

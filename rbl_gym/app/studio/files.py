@@ -240,7 +240,9 @@ def tables_of(problem: Problem) -> dict[str, Any]:
     mounts, noise = problem.mounts, problem.noise
     kinds = {Walls: "room", Box: "box", Shell: "shell"}
     if type(mounts) not in kinds or len(problem.obstacles.prisms):
-        raise ValueError("a problem with mounts or prisms needs the tables of its file")
+        raise ValueError(
+            "a problem with mounts or prisms can only be saved with the tables of its file"
+        )
     fields: Any = dataclasses.asdict(mounts)  # pyright: ignore[reportArgumentType]
     law = next(name for name, law in NOISE_LAWS.items() if type(noise) is law)
     values: Any = dataclasses.asdict(noise)  # pyright: ignore[reportArgumentType]

@@ -83,7 +83,9 @@ class Panel:
         self._asked: dict[int, deque[Any]] = {}
         self._headline = gui.add_html("")
         self._optimise = self._button("Optimise from here", "optimise", icon="trending-down")
-        self._optimise.hint = "Move all free anchors, step by step, as long as the error falls"
+        self._optimise.hint = (
+            "Move all free anchors step by step until the error no longer decreases"
+        )
         self._stop = self._button("Stop", "stop", icon="player-stop", color="gray")
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._group("History", {"Undo": "undo", "Redo": "redo"})

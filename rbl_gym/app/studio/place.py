@@ -190,7 +190,7 @@ class PlacePage:
             if found is not None and not now.fixed.any():
                 self._edit(lambda at: state.set_layout(at, Layout(found, at.fixed)))
                 return
-            self.status = "Searching the best layout from scratch ..."
+            self.status = "Searching for the best layout from scratch ..."
             self._show()
             threading.Thread(target=self._search, args=(now, True), daemon=True).start()
 

@@ -34,7 +34,7 @@ def add_best(state: State, seed: int = 0) -> State:
         raise ValueError(f"a layout has at most {MAX_ANCHORS} anchors")
     found = choosing.next_anchor(state.problem, state.anchors, seed)
     if found is None:
-        raise ValueError("no mount is left for one more anchor")
+        raise ValueError("no mount is free for another anchor")
     return with_one_more(state, found[0])
 
 

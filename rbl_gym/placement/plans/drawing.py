@@ -103,13 +103,13 @@ def scaled(drawing: Drawing, zero: tuple[float, float] | None) -> Drawing:
             step = 10 ** -math.floor(math.log10(scale)) if scale < 1 else 1.0
             zero = tuple((np.floor(low / step) * step).tolist())
             said.append(
-                f"the plan is far from its origin: ({zero[0]:.10g}, {zero[1]:.10g}) "
-                f"{drawing.units} of it is (0, 0) here"
+                f"the drawing is far from its origin: its point ({zero[0]:.10g}, {zero[1]:.10g}) "
+                f"{drawing.units} becomes (0, 0) in the file"
             )
     width, height = (high - low) * scale
     said.append(f"the plan is {width:.4g} x {height:.4g} m")
     if not _SMALL_M <= max(width, height) <= _LARGE_M:
-        said.append("this is an odd size for a building: check the unit (--units)")
+        said.append("this is an unusual size for a building: check the unit (--units)")
     shift = np.array(zero)
     return drawing._replace(
         zero=zero,

@@ -36,16 +36,16 @@ def read_dxf(path: str, units: str | None, zero: tuple[float, float] | None) -> 
         if named is None:
             size = _rough_size(model)
             raise ValueError(
-                f"{path}: the drawing does not say its unit ($INSUNITS = {code}){size}: "
-                f"give --units, one of {', '.join(UNITS)}"
+                f"{path}: the drawing does not state its unit ($INSUNITS = {code}){size}: give "
+                f"--units, one of {', '.join(UNITS)}"
             )
         units = named
         said.append(f"unit of the drawing: {units} ($INSUNITS = {code})")
     else:
         other = f"{named} ($INSUNITS = {code})" if named else f"$INSUNITS = {code}"
         said.append(
-            f"unit of the drawing: {units}, as told"
-            + ("" if named == units else f"; the drawing itself says {other}")
+            f"unit of the drawing: {units}, as given"
+            + ("" if named == units else f"; the drawing itself states {other}")
         )
     found = _Found(_FLATTENING_M / UNITS[units])
     for entity in model:
@@ -118,7 +118,8 @@ class _Found:
         if block is None or depth >= _DEPTH:
             raise ValueError("no block")
         if block.block.is_xref:
-            self.skipped[f"references to another drawing ({block.name}): bind it, or read it"] += 1
+            what = f"references to another drawing ({block.name}): bind or read that drawing"
+            self.skipped[what] += 1
             return
         if not len(block):
             return
@@ -183,7 +184,7 @@ def _open(path: str) -> Any:
         from ezdxf.lldxf.const import DXFError
     except ImportError:
         raise ValueError(
-            f"{path}: a DXF needs the extra placement: pip install 'rbl-gym[placement]'"
+            f"{path}: reading a DXF needs the extra placement: pip install 'rbl-gym[placement]'"
         ) from None
     with Path(path).open("rb"):  # an OSError names the file
         pass
@@ -194,9 +195,9 @@ def _open(path: str) -> Any:
     try:
         document, auditor = recover.readfile(path)
     except (OSError, DXFError, UnicodeError, ValueError, LookupError) as error:
-        raise ValueError(f"{path}: this is no DXF: {error}") from error
+        raise ValueError(f"{path}: not a DXF file: {error}") from error
     if auditor.has_errors:
-        raise ValueError(f"{path}: damaged DXF: {auditor.errors[0].message}")
+        raise ValueError(f"{path}: the DXF file is damaged: {auditor.errors[0].message}")
     return document
 
 

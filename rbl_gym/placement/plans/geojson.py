@@ -44,9 +44,9 @@ def read_geojson(
     drawing = Drawing(path, units or "m", (0.0, 0.0), shapes, [], unread, [])
     if units is None and shapes:
         _check_not_degrees(data, drawing)
-        drawing.said.append("coordinates are taken as metres")
+        drawing.said.append("coordinates are read as metres")
     elif units is not None:
-        drawing.said.append(f"unit of the coordinates: {units}, as told")
+        drawing.said.append(f"unit of the coordinates: {units}, as given")
     return _projected(drawing, zero) if units == "degrees" else scaled(drawing, zero)
 
 
@@ -66,7 +66,7 @@ def _check_not_degrees(data: Any, drawing: Drawing) -> None:
 def _features(data: Any, path: str) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Geometry and properties of each feature."""
     if not isinstance(data, dict) or "type" not in data:
-        raise ValueError(f"{path}: this is no GeoJSON: there is no 'type' at its top")
+        raise ValueError(f"{path}: not a GeoJSON file: it has no 'type' at its top level")
     if data["type"] == "FeatureCollection":
         features = data.get("features")
         if not isinstance(features, list):
@@ -134,7 +134,7 @@ def _projected(drawing: Drawing, zero: tuple[float, float] | None) -> Drawing:
     low, high = drawing.bounds()
     if np.abs([low[0], high[0]]).max() > 180 or np.abs([low[1], high[1]]).max() > 90:
         raise ValueError(
-            f"{drawing.path}: coordinates to ({high[0]:.7g}, {high[1]:.7g}) are no degrees"
+            f"{drawing.path}: coordinates to ({high[0]:.7g}, {high[1]:.7g}) are not degrees"
         )
     zero = tuple(low.tolist()) if zero is None else zero
     metres = [

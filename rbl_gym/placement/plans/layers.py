@@ -91,8 +91,8 @@ def building(
                 made.take(layer, use)
     if not made.used:
         made.said.append(
-            "nothing says what the layers are: give --walls LAYER, --obstacles LAYER, "
-            "--zones LAYER, --mounts LAYER"
+            "the use of the layers is not given: give --walls LAYER, --obstacles LAYER, --zones "
+            "LAYER, --mounts LAYER"
         )
     made.complete()
     return Building(made.tables(n_anchors), made.used, made.said)
@@ -131,7 +131,7 @@ class _Maker:
         self.used.setdefault(layer, []).append(use.kind)
         for count, what in left:
             if count:
-                self.said.append(f"layer {layer}, taken for {use.kind}: {count} {what}")
+                self.said.append(f"layer {layer}, read as {use.kind}: {count} {what}")
 
     # --- kinds: entries, and (count, what) of shapes that were left out --------------------------
 
@@ -148,10 +148,10 @@ class _Maker:
         if widest is not None:
             rows, twins = self._centred(lines, use, widest)
         note = (
-            f"pairs of lines less than {widest:g} m apart, each taken for one wall" if twins else ""
+            f"pairs of lines less than {widest:g} m apart, each read as one wall" if twins else ""
         )
         return _commented(rows, layer), [
-            (count_blocks(marks), "blocks taken by their lines, marks left out"),
+            (count_blocks(marks), "blocks, of which only the lines are read"),
             (len(marks) - count_blocks(marks), "points left out"),
             (len(twins), note),
         ]
@@ -223,7 +223,7 @@ class _Maker:
                 heights = {"height_m": self.height} if flat else sides
                 values = self._values(line, use, allowed, name | heights)
                 rows.append({"kind": own, "polygon": points_of(ring), **values})
-        return _commented(rows, layer), [(len(left), "shapes that are no ring were left out")]
+        return _commented(rows, layer), [(len(left), "shapes that are not closed were left out")]
 
     def _fixed(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
         return spots_of(marks, lines, use), [
@@ -247,7 +247,7 @@ class _Maker:
             failed += line.holes != () and len(ring) == len(line.points)
             rows.append({"polygon": points_of(ring), **self._values(line, use, keys, usual)})
         return _commented(rows, layer), [
-            (len(lines) - len(rows), "lines that close no area were left out"),
+            (len(lines) - len(rows), "lines that enclose no area were left out"),
             (failed, "holes could not be cut out"),
             (len(marks) - count_blocks(marks), "points left out"),
         ]
@@ -267,7 +267,7 @@ class _Maker:
             if "information" not in values:
                 raise ValueError(
                     f"{self.drawing.path}: layer {use.layer}: material must be one of "
-                    f"{', '.join(MATERIALS)}, got {other!r}; any other: information=SHARE"
+                    f"{', '.join(MATERIALS)}, got {other!r}; for any other, information=SHARE"
                 )
         elif "material" in values and "information" in values:
             values.pop("information" if "material" in said else "material")
@@ -286,7 +286,7 @@ class _Maker:
             low = min(_MOUNT_LOW_M, 0.7 * self.height)
             self.found["mounts"] = [
                 {
-                    "#": "no layer says where anchors may stand: on every wall, from both sides",
+                    "#": "no layer of mounts: anchors may stand on both sides of every wall",
                     "kind": "wall",
                     **{key: wall[key] for key in ("line", "closed") if key in wall},
                     "low_m": rounded(max(low, wall["low_m"])),
@@ -302,7 +302,7 @@ class _Maker:
                 self.said.append("no layer of mounts or walls: anchors may stand on the ceiling")
                 self.found["mounts"] = [
                     {
-                        "#": "no layer says where anchors may stand: on the ceiling",
+                        "#": "no layer of mounts: anchors may stand on the ceiling",
                         "kind": "ceiling",
                         "polygon": self._outline(),
                         "height_m": rounded(self.height),
@@ -312,7 +312,7 @@ class _Maker:
             self.said.append("no layer of zones: the body works in the whole rectangle of the plan")
             self.found["zones"] = [
                 {
-                    "#": "no layer is a zone: the whole rectangle of the plan",
+                    "#": "no layer of zones: the whole rectangle of the plan",
                     "polygon": self._outline(),
                     "name": "plan",
                     "low_m": ZONE_M[0],

@@ -63,7 +63,7 @@ def of_picture(plan: dict[str, Any], height_m: float = 3.0, n_anchors: int = 8) 
         "anchors": {"number": n_anchors},
         "zones": [
             {
-                "#": "a picture has no zones: all of it but its margins",
+                "#": "a picture has no zones: this one is the whole picture without its margins",
                 "name": "plan",
                 "polygon": inner,
                 **dict(zip(("low_m", "high_m"), ZONE_M, strict=True)),
@@ -71,7 +71,7 @@ def of_picture(plan: dict[str, Any], height_m: float = 3.0, n_anchors: int = 8) 
         ],
         "mounts": [
             {
-                "#": 'the ceiling above the picture; others: kind = "wall", line = [[x, y], ...]',
+                "#": 'the ceiling above the picture; walls: kind = "wall", line = [[x, y], ...]',
                 "kind": "ceiling",
                 "polygon": outline,
                 "height_m": height_m,
@@ -98,4 +98,4 @@ def pixels(path: str) -> tuple[int, int]:
             with Image.open(file) as image:
                 return image.size
         except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
-            raise ValueError(f"{path}: this is no picture: {error}") from error
+            raise ValueError(f"{path}: not a picture: {error}") from error

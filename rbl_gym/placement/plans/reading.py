@@ -50,7 +50,7 @@ def read_drawing(
     if suffix != ".dxf":
         return geojson.read_geojson(path, units, zero, layer_property)
     if units == "degrees":
-        raise ValueError(f"{path}: units of a DXF must be a length, got degrees")
+        raise ValueError(f"{path}: units of a DXF must be units of length, got degrees")
     if layer_property is not None:
         raise ValueError(f"{path}: layer_property applies to GeoJSON only, got {layer_property!r}")
     return dxf.read_dxf(path, units, zero)

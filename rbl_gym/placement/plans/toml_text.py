@@ -11,18 +11,18 @@ __all__ = ["plain", "to_toml"]
 _WIDTH = 96
 # Remarks on tables, by their name.
 _REMARKS = {
-    "anchors": "how many are to be placed; `fixed` ones, if any, are counted",
-    "zones": "where the body works. What you ask for: position_m = 0.10, heading_deg = 5.0, "
+    "anchors": "number of anchors to place, `fixed` ones included",
+    "zones": "where the body works; requirements: position_m = 0.10, heading_deg = 5.0, "
     "share = 0.95 of the zone",
     "mounts": "where anchors may stand: wall, ceiling, column, area or points",
     "forbidden": "no anchors here",
-    "walls": "each crossing leaves the share of a link's information that its material says",
-    "obstacles": "what stands in the way of links, and of the body",
+    "walls": "after each crossing the share of a link's information that its material sets is left",
+    "obstacles": "what weakens links, and where the body cannot be",
     "materials": "share of a link's information that one crossing leaves, 10^(-loss / 10 dB): "
-    "rough, put yours",
-    "plan": "what the plan was read from; layouts are exported to its coordinates",
+    "rough values, put your own",
+    "plan": "the drawing from which this was read; layouts are exported to its coordinates",
     "body": "the tags on the body: a shape, or tags = [[x, y, z], ...] in metres",
-    "noise": "standard deviation of a range: put that of your radio",
+    "noise": "standard deviation of a range: put the one of your radio",
 }
 
 

@@ -67,7 +67,8 @@ def parse_use(kind: str, text: str) -> Use:
     ):
         raise ValueError(
             f"--{kind} {layer}: material must be one of {', '.join(MATERIALS)}, got "
-            f"{values['material']!r}; any other: information=SHARE, what a crossing leaves"
+            f"{values['material']!r}; for any other, information=SHARE, the share that a crossing "
+            "leaves"
         )
     return Use(kind, layer, values)
 

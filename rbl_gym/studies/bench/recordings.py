@@ -51,10 +51,10 @@ def load_recording(spec: Mapping[str, Any]) -> Log:
     unknown = [key for key in spec if key not in (*FILES, *SETTINGS)]
     if unknown:
         known = ", ".join((*FILES, *SETTINGS))
-        raise ValueError(f"a recording has no {unknown[0]!r}; it has {known}")
+        raise ValueError(f"a recording has no key {unknown[0]!r}; its keys are {known}")
     for key in FILES[:4]:
         if key not in spec:
-            raise ValueError(f"a recording needs {key!r}, got {', '.join(spec)}")
+            raise ValueError(f"a recording needs the key {key!r}, got {', '.join(spec)}")
     files = [Path(spec[key]).stat() for key in FILES if key in spec]
     stamps = tuple((file.st_mtime_ns, file.st_size) for file in files)
     # What JSON gives as a list cannot be the key of a cache.
@@ -115,7 +115,7 @@ def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:
     found = replay.track_errors(log.recording, track, log.settings)
     assert found is not None
     if found.rotation is None or found.tags is None:
-        raise ValueError("a recording of the benchmark needs truth with rotations")
+        raise ValueError("a recording of the benchmark must have truth with rotations")
     known = np.flatnonzero(found.known)
     count = min(SEGMENTS, len(known))
     length = len(known) // count

@@ -111,9 +111,9 @@ def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None
         for name in _COMMON:
             if record[name] != common[name]:
                 raise ValueError(
-                    f"{where} has records of {name} {record[name]}, this run is of "
-                    f"{common[name]}: a file takes one run: use --out F, or --fresh, which "
-                    "drops the old records; workers need the same versions"
+                    f"{where} has records with {name} {record[name]}, but this run has "
+                    f"{common[name]}, and a file holds one run: choose another file with --out F, "
+                    "or drop the old records with --fresh. All workers need the same versions"
                 )
 
 
@@ -136,7 +136,7 @@ def read_records(path: Path) -> Records:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if number == len(lines):
                 break
-            raise ValueError(f"{path}, line {number}: no record of rbl-gym bench") from error
+            raise ValueError(f"{path}, line {number}: not a record of rbl-gym bench") from error
         records.append(record)
     return records
 
@@ -160,7 +160,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is not text in UTF-8: {error}") from error
+        raise ValueError(f"{path}: must be UTF-8 text: {error}") from error
 
 
 def _timing(record: Mapping[str, Any], microseconds: float | None) -> dict[str, Any]:

@@ -71,7 +71,9 @@ def read_spec(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from error
     if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
-        raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")
+        raise ValueError(
+            f"{path}: must have the key 'name' of a scene, or the files of a recording"
+        )
     for key in FILES if "ranges" in spec else ():
         if not isinstance(spec.get(key, ""), str):
             raise ValueError(f"{path}: {key} must be the name of a file, got {spec[key]!r:.80}")

@@ -24,12 +24,13 @@ from rbl_gym.worlds.scene import Scene
 NLOS_PROBABILITY, DROP_PROBABILITY = 0.1, 0.5
 NOISE_FACTOR, ANCHOR_ERROR_M, TAG_ERROR_M = 2.0, 0.5, 0.05
 CONDITIONS = {
-    "nominal": "the filter knows the scene as it is",
-    "nlos": "10 % of the ranges over a reflected path, as much longer as the scene's links say",
+    "nominal": "the filter has the true parameters of the scene",
+    "nlos": "10 % of the ranges come over a reflected path, with the excess length set in the "
+    "scene's links",
     "lost-links": "half of the links give no range",
-    "noise-x2": "noise twice what the filter is told",
-    "anchor-off": "the filter's place of the first anchor is 0.5 m off, another way every trial",
-    "tag-off": "the filter's place of the first tag is 5 cm off",
+    "noise-x2": "the noise is twice as large as the filter assumes",
+    "anchor-off": "the filter's position of the first anchor is 0.5 m off, in a random direction",
+    "tag-off": "the filter's position of the first tag is 5 cm off",
 }
 # Which stream of a scene's randomness: what happens, the links besides, the errors of the told.
 _WORLD, _LINKS, _TOLD = range(3)
@@ -115,7 +116,7 @@ def _noisier(noise: Any, factor: float) -> Any:
         if field.name in ("floor_m", "proportional", "sigma_m")
     }
     if not scaled:
-        raise ValueError(f"condition noise-x2 cannot double {noise!r:.80}")
+        raise ValueError(f"condition 'noise-x2' cannot double the noise law {noise!r:.80}")
     return dataclasses.replace(noise, **scaled)
 
 

@@ -181,10 +181,13 @@ def survey_anchors(
         If anchors move, an id is unknown, no start is found, or there are too few ranges.
     """
     if recording.anchors.ndim > 2:
-        raise ValueError("anchors must stand to be surveyed, got anchors that move")
+        raise ValueError("anchors must be fixed to be surveyed, got moving anchors")
     unknown = [name for name in settings.known if name not in recording.anchor_ids]
     if unknown:
-        raise ValueError(f"known: no anchor {unknown[0]!r}, they are {recording.anchor_ids!r:.200}")
+        raise ValueError(
+            f"known must be anchors of the recording, got {unknown[0]!r}; the anchors are "
+            f"{recording.anchor_ids!r:.200}"
+        )
     known = np.isin(recording.anchor_ids, settings.known)
     at = slice(None, None, -(-len(recording.times) // settings.epochs))
     ranges, links, times = recording.ranges[at], recording.links[at], recording.times[at]
@@ -233,9 +236,9 @@ def _start(
             layouts.append((layout, bias))
     if not layouts:
         raise ValueError(
-            f"{M} anchors do not come out from nothing (that takes {6 if planar else 10} or more "
-            "that a tag hears at one time, or ranges between them): give rough places and start "
-            "from the table"
+            f"{M} anchors cannot be located without rough positions, as this takes "
+            f"{6 if planar else 10} or more anchors in range of a tag at one time, or ranges "
+            "between the anchors: give rough positions and set start to 'table'"
         )
     best: tuple[float, SurveyState] | None = None
     for layout, bias in layouts:
@@ -297,16 +300,16 @@ def _result(
     said = []
     if survey.scale_std > _SCALE:
         said.append(
-            f"size of the layout better than {100 * survey.scale_std:.2g} %: it trades off with "
-            f"the common bias (correlation {survey.scale_bias_correlation:.2f}, bias +- "
+            f"size of the layout to better than {100 * survey.scale_std:.2g} %: it trades off "
+            f"with the common bias (correlation {survey.scale_bias_correlation:.2f}, bias +- "
             f"{survey.bias_std_m:.3f} m); give bias_m and bias_std_m, or a known pair of anchors"
         )
     if settings.planar:
-        said.append("heights: everything is taken to be level")
+        said.append("heights: all anchors and tags are assumed at one height")
     arms = recording.tags - recording.tags.mean(axis=0)
     rank = np.linalg.matrix_rank(arms[:, : 2 if settings.planar else 3], tol=1e-3)
     if rank < (2 if settings.planar else 3) and known.sum() < 3 and settings.start == "ranges":
-        said.append("which of two mirror images the layout is: the tags do not tell")
+        said.append("which of two mirror images the layout is: the tags do not determine it")
     frame = (
         "the known anchors"
         if known.sum() >= (2 if settings.planar else 3)

@@ -57,7 +57,7 @@ def calibrate_inertial(
         axis only.
     """
     if truth.rotation is None:
-        raise ValueError("truth must have rotations, got positions alone")
+        raise ValueError("truth must have rotations, got only positions")
     middle = 0.5 * (truth.times[1:] + truth.times[:-1])
     step = np.diff(truth.times)
     world = rotations.error(truth.rotation[1:], truth.rotation[:-1]) / step[:, None]

@@ -50,14 +50,16 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
         if run.anchor_ids != first.anchor_ids or run.tag_ids != first.tag_ids:
             raise ValueError(f"{label}runs must have the same anchors and tags")
         if run.truth is None:
-            raise ValueError(f"{label}links are calibrated by truth, and the recording has none")
+            raise ValueError(
+                f"{label}links are calibrated by the truth, but the recording has none"
+            )
         if run.truth.rotation is None and (len(run.tags) > 1 or run.tags.any()):
             raise ValueError(
-                f"{label}the truth must have rotations where tags are off the body's origin, got "
-                "positions alone"
+                f"{label}the truth must have rotations if tags are off the body's origin, got "
+                "only positions"
             )
         if run.truth.planar and not settings.planar:
-            raise ValueError(f"{label}the truth has no heights: say planar")
+            raise ValueError(f"{label}the truth has no heights: set planar")
         if run.truth.planar and settings.height_offset_m is None:
             heights = run.anchors[..., 2]
             if np.ptp(heights) > 0.1:

@@ -300,7 +300,7 @@ def _untold(
             "too little; bias and slope trade off"
         )
     if settings.time_offset == "auto" and clock is None:
-        said.append("time offset of the truth: the ranges change too little; taken as 0")
+        said.append("time offset of the truth: the ranges change too little; 0 is assumed")
     axes = "xyz"
     if settings.planar:
         said.append("heights of the tags, and the truth's roll and pitch: the motion is planar")
@@ -312,9 +312,9 @@ def _untold(
     elif model.tags == "free":
         if found is not None and found.spread_m > 0.005:
             said.append(
-                f"places of the tags to better than {found.spread_m:.3f} m: their ranges depend on "
-                "the direction of the ray by harmonics of this size, and the first one of a tag is "
-                "the same as a shift of it"
+                f"positions of the tags to better than {found.spread_m:.3f} m: the bias by "
+                "direction has harmonics of this size, and the first harmonic of a tag has the "
+                "same effect as a shift of the tag"
             )
         for n, i in np.argwhere(fit.tags_std_m > _UNTOLD * ARM_M):
             said.append(f"{axes[i]} of tag {ids[1][n]}")

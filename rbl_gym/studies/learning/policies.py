@@ -111,7 +111,9 @@ class Policy(NamedTuple):
         multi-binary one (for each entry whether it may be 0 and whether it may be 1).
         """
         if self.lstm is not None:
-            raise ValueError("a policy with a memory is played by player(), one for each episode")
+            raise ValueError(
+                "a recurrent policy must be played by player(), with a new player for each episode"
+            )
         return self._action(self._read(observation), mask)
 
     def player(self) -> Callable[[Any, np.ndarray], np.ndarray]:
@@ -225,7 +227,7 @@ def load(path: str | Path) -> AnyPolicy:
         _check_layers(policy)
     # zipfile and numpy raise unrelated exceptions for a broken archive.
     except Exception as error:
-        raise ValueError(f"{path} is no policy of rbl-gym: {error}") from error
+        raise ValueError(f"{path} is not a policy of rbl-gym: {error}") from error
     return policy
 
 
@@ -238,7 +240,7 @@ def _layers(arrays: dict[str, np.ndarray], name: str) -> tuple[tuple[FloatArray,
 def _check_layers(policy: Policy) -> None:
     """Raise ValueError unless the layers are finite and fit together."""
     if not policy.weights:
-        raise ValueError("it has no layers")
+        raise ValueError("the file has no layers")
     n_in = policy.weights[0].shape[-1]
     if policy.lstm is not None:
         for name, array in policy.lstm._asdict().items():
@@ -273,7 +275,7 @@ def check_fit(policy: AnyPolicy, label: str, envs: Any) -> None:
     if isinstance(policy, SetPolicy):
         wanted = SET_KINDS[policy.kind][0]
         if envs.unwrapped.spec.id != wanted:
-            raise ValueError(f"{trained} and plays {wanted}, not {envs.unwrapped.spec.id}")
+            raise ValueError(f"{trained} and is for {wanted}, got {envs.unwrapped.spec.id}")
         return
     seen = getattr(envs, "single_observation_space", envs.observation_space)
     acted = getattr(envs, "single_action_space", envs.action_space)
@@ -281,5 +283,5 @@ def check_fit(policy: AnyPolicy, label: str, envs: Any) -> None:
     got = (policy.n_inputs, policy.kind, len(policy.biases[-1]))
     if got != asked:
         raise ValueError(
-            f"{trained} and has (observation, kind, outputs) = {got}, the task's are {asked}"
+            f"{trained} with (observation, kind, outputs) = {got}, but the task has {asked}"
         )

@@ -23,10 +23,10 @@ __all__ = ["ALGORITHMS", "train"]
 # The algorithms, and the kinds of policies that they train.
 ALGORITHMS = {
     "ppo": "a multilayer perceptron",
-    "maskable-ppo": "the same, which is told the actions that there are",
-    "recurrent-ppo": "one with a memory (LSTM)",
-    "set-ppo": "one network for craft of any number, which starts as the orbit",
-    "supervised": "a choice of any number of anchors by what will be in sight",
+    "maskable-ppo": "a multilayer perceptron with masks of the actions that are allowed",
+    "recurrent-ppo": "a recurrent network (LSTM)",
+    "set-ppo": "one network for any number of craft, which starts as the policy 'orbit'",
+    "supervised": "a choice of any number of anchors by the links that it predicts to be in sight",
 }
 # Units of the memory, and of the layer after it.
 _MEMORY, _BEHIND = 64, 64
@@ -69,8 +69,8 @@ def train(
     """
     if seed * SEED_STRIDE >= HELD_OUT_SEED:
         raise ValueError(
-            f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
-            "worlds of larger ones are held out for evaluations"
+            f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the worlds of larger "
+            "seeds are held out for evaluations"
         )
     algorithm = check_one_of("algorithm", algorithm or task.algorithm, list(ALGORITHMS))
     _check_goes_with(algorithm, task)
@@ -98,7 +98,7 @@ def _check_goes_with(algorithm: str, task: RlTask) -> None:
     if algorithm in _TAUGHT:
         if task.env_id != _TAUGHT[algorithm]:
             raise ValueError(
-                f"algorithm {algorithm!r} is for {_TAUGHT[algorithm]}, the task is of {task.env_id}"
+                f"algorithm {algorithm!r} is for {_TAUGHT[algorithm]}, got a task of {task.env_id}"
             )
     elif algorithm == "maskable-ppo":
         kind, _ = kind_and_outputs(task.make(1).single_action_space)

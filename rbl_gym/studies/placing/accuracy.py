@@ -105,7 +105,7 @@ def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: i
             return free[:count]
         drawn = low + rng.random((max(_DRAWN, 2 * count), 3)) * (high - low)
         free = np.concatenate([free, drawn[is_free(problem, zone, drawn)]])
-    raise ValueError(f"zone {zone.name!r} has hardly any free place: obstacles cover it")
+    raise ValueError(f"zone {zone.name!r} has almost no free place: obstacles cover it")
 
 
 def is_free(problem: Problem, zone: Zone, places: FloatArray) -> BoolArray:

@@ -106,7 +106,7 @@ def place_anchors(problem: Problem, question: Question, advance: Advance = silen
     check_one_of("start", question.start, design.STARTS)
     if question.start != "search" and (question.fewest or question.layout is not None):
         raise ValueError(
-            f"start must be 'search' with a layout or the least number, got {question.start!r}"
+            f"start must be 'search' with a layout or with fewest, got {question.start!r}"
         )
     problem, start = _with_kept(problem, question)
     seed, survive = question.seed, question.survive
@@ -149,7 +149,7 @@ def _with_kept(problem: Problem, question: Question) -> tuple[Problem, FloatArra
         return problem, None
     if not question.optimise:
         if question.keep:
-            raise ValueError("keep means nothing where the layout is only judged: optimise it")
+            raise ValueError("keep needs optimise: a layout that is only judged stays as it is")
         return problem, layout
     kept = [k for k in range(len(layout)) if k in question.keep or _is_in(layout[k], problem.fixed)]
     apart = [place for place in problem.fixed if not _is_in(place, layout)]
@@ -157,8 +157,8 @@ def _with_kept(problem: Problem, question: Question) -> tuple[Problem, FloatArra
     others = np.delete(layout, kept, axis=0)
     if len(fixed) + len(others) > question.numbers[0]:
         raise ValueError(
-            f"the number of anchors must be at least {len(fixed) + len(others)}, those of the "
-            f"layout and the fixed ones, got {question.numbers[0]}"
+            f"the number of anchors must be at least {len(fixed) + len(others)}, the anchors of "
+            f"the layout and the fixed ones, got {question.numbers[0]}"
         )
     return dataclasses.replace(problem, fixed=fixed), np.concatenate([fixed, others])
 

@@ -88,8 +88,8 @@ def sensor_clock(
         best = max(tried, key=lambda x: seen[x])
         if step == _STEPS[0] and best in (tried[0], tried[-1]):
             raise ValueError(
-                f"{name}: the ranges are likeliest at {best:+.2f} s, the end of what is tried; "
-                "give a rough offset"
+                f"{name}: the likelihood of the ranges is highest at {best:+.2f} s, the end of "
+                "the search; give a rough offset"
             )
         advance()
     fine = _STEPS[-1]
@@ -105,7 +105,7 @@ def sensor_clock(
 def _inertial_clock(recording: Recording, settings: Settings) -> SensorClock:
     log = recording.inertial
     if log is None:
-        raise ValueError("imu_offset_s is of imu, and the recording has none")
+        raise ValueError("imu_offset_s needs imu, but the recording has none")
     recording, settings = local_trial(recording, settings)
     k, m, n = (a[:_MOST_RANGES] for a in np.nonzero(recording.links))
     told = TaggedRanges(

@@ -35,7 +35,8 @@ def diagnose(
         if ratio < _WIDE:
             notes.append(
                 "Note: the filter expects more scatter than the ranges show (NIS per degree of "
-                f"freedom {ratio:.2f}): right where the errors of a link last, else see --tune."
+                f"freedom {ratio:.2f}): right if the errors of a link are correlated in time, "
+                "else see --tune."
             )
         return {**figures, "causes": []}, notes
     if recording.offset is not None:
@@ -49,12 +50,12 @@ def diagnose(
 def _subject(figures: dict[str, Any]) -> str:
     ratio, refused = figures["nis_per_dof"], figures["refused_share"]
     # Of one link among many neither figure tells.
-    subject = "the filter contradicts its data"
+    subject = "the filter does not fit its data"
     if ratio < MOST_NIS and refused < MOST_REFUSED:
-        subject = "a part of the ranges contradicts the filter"
+        subject = "a part of the ranges does not fit the filter"
     return (
-        f"WARNING: {subject}: NIS per degree of freedom {ratio:.2f} (1: honest), "
-        f"{100 * refused:.0f} % of the ranges refused. "
+        f"WARNING: {subject}: NIS per degree of freedom {ratio:.2f} (1: consistent), "
+        f"{100 * refused:.0f} % of the ranges rejected. "
     )
 
 
@@ -62,8 +63,9 @@ def _warning(figures: dict[str, Any], causes: list[Cause]) -> str:
     text = _subject(figures)
     if not causes:
         return text + (
-            "No one fault explains it (tried: motion, deviation of the ranges, swaps, places of "
-            "anchors, biases, units). Look at the residuals of anchors, tags and links; see --tune."
+            "No single fault explains it (tried: motion, deviation of the ranges, swaps, "
+            "positions of anchors, biases, units). Look at the residuals of anchors, tags and "
+            "links; see --tune."
         )
     named = "; and ".join(cause.text for cause in causes)
     return f"{text}Likely: {named} (NIS per degree of freedom {causes[-1].nis_per_dof:.2f} then)."

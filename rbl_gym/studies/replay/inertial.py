@@ -40,9 +40,9 @@ def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> 
     inside = np.flatnonzero((recording.times >= low) & (recording.times <= high))
     if not len(inside):
         raise ValueError(
-            f"imu has readings from {log.times[0]:.6g} to {log.times[-1]:.6g} s of the ranges' "
-            f"clock, which are of {recording.times[0]:.6g} to {recording.times[-1]:.6g} s: see "
-            "--time-offset imu=S"
+            f"imu has readings from {log.times[0]:.6g} to {log.times[-1]:.6g} s by the clock of "
+            f"the ranges, but the ranges are from {recording.times[0]:.6g} to "
+            f"{recording.times[-1]:.6g} s: see --time-offset imu=S"
         )
     part = slice(inside[0], inside[-1] + 1)
     std, anchors = recording.range_std, recording.anchors

@@ -160,7 +160,7 @@ def truth_of(recording: Recording, track: Track, settings: Settings) -> Referenc
     known = known & ~out
     if not known.any():
         raise ValueError(
-            f"truth_exclude leaves no epoch with truth: {out.sum()} of {len(known)} had it"
+            f"truth_exclude must leave an epoch with truth, but excludes all {out.sum()} of them"
         )
     place = translation.copy()
     if planar:
@@ -198,7 +198,7 @@ def with_offset(settings: Settings, found: TimeOffset | None) -> Settings:
 def _mode(settings: Settings, planar: bool) -> str:
     mode = settings.comparison.align
     if mode == "se3" and planar:
-        raise ValueError("a plane has no heights to align: take yaw")
+        raise ValueError("planar motion has no heights to align: use 'yaw'")
     return mode
 
 

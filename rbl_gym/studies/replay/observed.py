@@ -66,8 +66,7 @@ def rank_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], li
         spread = np.rad2deg(found.turn_std[-1, found.turns[-1] :])
         what = (
             "the rotation",
-            "of the rotation more than that about the body's axis "
-            f"{_axis(found.turn_axes[-1, :, 0])}",
+            f"the rotation, except that about the body's axis {_axis(found.turn_axes[-1, :, 0])}",
             f"the rotation about the body's axis {_axis(found.turn_axes[-1, :, 2])}",
         )[int(found.turns[-1])]
         std = f"{spread.max():.0f} deg" if spread.max() < 180 else "beyond 180 deg"
@@ -98,6 +97,6 @@ def _axis(axis: FloatArray) -> str:
 def _note(what: str, std: str, since: float) -> str:
     when = "from the start" if since == 0 else f"since {since:.1f} s"
     return (
-        f"Note: the ranges do not determine {what}: standard deviation {std} at the end, "
-        f"{when}. The belief is as wide."
+        f"Note: the ranges do not determine {what}: standard deviation {std} at the end, {when}. "
+        "The covariance includes this."
     )

@@ -144,7 +144,8 @@ def height_offset(recording: Recording, settings: Settings) -> float:
     told = (known.height_offset_m, known.height_m, known.start)
     if known.planar and all(x is None for x in told) and np.ptp(heights) > _PLANE_M:
         raise ValueError(
-            f"height_offset_m must be given for anchors at heights of {heights.min():g} to "
-            f"{heights.max():g} m: how far the tags lie below the anchors' mean height; or height_m"
+            "height_offset_m (of the tags' mean height below the anchors' mean height) or "
+            f"height_m must be given, as the anchors have heights of {heights.min():g} to "
+            f"{heights.max():g} m"
         )
     return settings.knowledge.height_offset_m or 0.0

@@ -136,23 +136,27 @@ class Knowledge:
 
     def __post_init__(self) -> None:
         if check_number("height_offset_m", self.height_offset_m or 0.0) != 0 and not self.planar:
-            raise ValueError("height_offset_m means nothing without planar")
+            raise ValueError("height_offset_m needs planar")
         for name in ("prior_position_m", "prior_rotation_deg"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), low=1e-6)
                 if self.start is None:
-                    raise ValueError(f"{name} means nothing without start")
+                    raise ValueError(f"{name} needs start")
         for name in ("height_std_m", "tilt_std_deg"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), low=1e-6)
                 if self.planar:
-                    raise ValueError(f"planar holds height, roll and pitch: leave out {name}")
+                    raise ValueError(
+                        f"{name} must be left out with planar, which holds height, roll and pitch"
+                    )
         if self.height_m is not None:
             check_number("height_m", self.height_m)
             if self.height_std_m is None and not self.planar:
-                raise ValueError("height_m needs height_std_m, or planar, which holds it")
+                raise ValueError("height_m needs height_std_m, or planar, which holds the height")
             if self.height_offset_m:
-                raise ValueError("height_m and height_offset_m say the same: give one")
+                raise ValueError(
+                    "height_m and height_offset_m must not both be given: they set the same height"
+                )
         elif self.height_std_m is not None:
             raise ValueError("height_std_m needs height_m")
         if self.start is not None:
@@ -310,7 +314,9 @@ class Settings:
         known = self.flat()
         unknown = [name for name in fields if name not in known]
         if unknown:
-            raise ValueError(f"settings have no {unknown[0]!r}; they have {', '.join(known)}")
+            raise ValueError(
+                f"settings have no field {unknown[0]!r}; the fields are {', '.join(known)}"
+            )
         # The options were those of the other filter.
         options = dict(
             fields.get("filter_options", () if "filter" in fields else self.filter_options)
@@ -341,7 +347,7 @@ class Settings:
 def _start(start: Any) -> tuple[float, ...]:
     values = tuple(check_number("start", x) for x in start)
     if len(values) not in (3, 4):
-        raise ValueError(f"start must be x, y, z and perhaps yaw_deg, got {len(values)} numbers")
+        raise ValueError(f"start must be x, y, z and optionally yaw_deg, got {len(values)} numbers")
     return values
 
 

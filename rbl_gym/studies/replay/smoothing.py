@@ -195,6 +195,6 @@ def _check_size(recording: Recording, settings: Settings) -> None:
     if memory > _MOST_MEMORY:
         raise ValueError(
             f"smoothing {K} epochs with drifting biases of {M * N} links would take "
-            f"{memory / 1e9:.0f} GB: set smooth_bias_std_m (of iekf-imu drift_std_m) to 0, or "
-            "smooth shorter logs"
+            f"{memory / 1e9:.0f} GB of memory: set smooth_bias_std_m (of iekf-imu drift_std_m) to "
+            "0, or smooth shorter logs"
         )

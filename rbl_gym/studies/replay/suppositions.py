@@ -68,7 +68,7 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
         yield Supposition("units", text, _with(trial, shrunk), scale=scale)
         for field in ("anchors", "tags"):
             changed = recording._replace(**{field: scale * getattr(recording, field)})
-            text = f"the places of the {field} look like {unit}"
+            text = f"the positions of the {field} look like {unit}"
             yield Supposition("units", text, _with(trial, changed))
     for bias in _BIASES_M:
         yield _common_bias(trial, bias)
@@ -179,7 +179,7 @@ def _noisier(trial: Trial, more: float) -> Supposition:
     if std is None and own is not None:
         std = float(np.median(own[recording.links]))
     value = more * (std or DEFAULT_RANGE_STD_M)
-    text = f"the ranges scatter more than they are said to: --range-std-m {value:.2g} or so"
+    text = f"the ranges scatter more than assumed: try --range-std-m {value:.2g}"
     return Supposition(
         "range-std", text, trial._replace(settings=settings.changed(range_std_m=value))
     )
@@ -187,7 +187,7 @@ def _noisier(trial: Trial, more: float) -> Supposition:
 
 def _moves(what: str, changed: dict[str, float]) -> str:
     options = " ".join(f"--{name.replace('_', '-')} {value:.3g}" for name, value in changed.items())
-    return f"the body moves more than the {what} allows: {options} or so"
+    return f"the body moves more than the {what} allows: try {options}"
 
 
 def _most_active(recording: Recording, axis: int) -> np.ndarray:
@@ -214,7 +214,7 @@ def _biased(trial: Trial, kind: str, name: str, mine: np.ndarray, bias: float) -
     ranges = np.where(mine, np.maximum(recording.ranges - bias, 1e-3), recording.ranges)
     side = "long" if bias > 0 else "short"
     changed = recording._replace(ranges=np.where(recording.links, ranges, 0.0))
-    learned = " (--raw learns biases that stay)" if trial.settings.filter == "iekf" else ""
+    learned = " (--raw estimates constant biases)" if trial.settings.filter == "iekf" else ""
     text = f"{name} look {abs(bias):.2f} m too {side}{learned}"
     return Supposition(kind, text, _with(trial, changed))
 
@@ -231,7 +231,7 @@ def _height(trial: Trial, step: float) -> Supposition:
     else:
         told = {"height_m": known.height_m - step}
     ((name, value),) = told.items()
-    text = f"the tags look to be at another height: --{name.replace('_', '-')}={value:.2f} or so"
+    text = f"the tags look to be at another height: try --{name.replace('_', '-')}={value:.2f}"
     return Supposition("height", text, trial._replace(settings=trial.settings.changed(**told)))
 
 
@@ -273,5 +273,8 @@ def _moved(trial: Trial, rotation: FloatArray, translation: FloatArray, m: int) 
     anchors = recording.anchors.copy()
     anchors[..., m, :] += step
     words = ", ".join(f"{x:+.2f}" for x in step)
-    text = f"anchor {recording.anchor_ids[m]} looks to be off: it fits moved by ({words}) m"
+    text = (
+        f"anchor {recording.anchor_ids[m]} looks misplaced: it fits the ranges if moved by "
+        f"({words}) m"
+    )
     return Supposition("anchor-moved", text, _with(trial, recording._replace(anchors=anchors)), 3)

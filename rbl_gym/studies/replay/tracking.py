@@ -208,15 +208,15 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
         filter does not support.
     """
     if (recording.inertial is None) == (settings.filter == "iekf-imu"):
-        what = "iekf-imu needs imu" if recording.inertial is None else "imu is read by iekf-imu"
-        raise ValueError(f"{what}, and the filter is {settings.filter!r}")
+        what = "iekf-imu needs imu" if recording.inertial is None else "only iekf-imu uses imu"
+        raise ValueError(f"{what}, got the filter {settings.filter!r}")
     if recording.odometry is not None and settings.filter != "iekf-log":
-        raise ValueError(f"odometry is read by the filter iekf-log, not by {settings.filter!r}")
+        raise ValueError(f"only the filter iekf-log uses odometry, got {settings.filter!r}")
     options = _options(recording, settings)
     if recording.directions is not None:
         if settings.filter not in _DIRECTED:
             raise ValueError(
-                f"directions are read by {', '.join(_DIRECTED)}, not by {settings.filter!r}"
+                f"only the filters {', '.join(_DIRECTED)} use directions, got {settings.filter!r}"
             )
         options["directions"] = recording.directions
     options |= dict(settings.filter_options)

@@ -85,12 +85,12 @@ def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
                 f"see --time-offset ({shift:.10g}, or auto)"
             )
         raise ValueError(
-            f"no epoch has truth: the truth shares no time with the ranges: {where}, "
+            f"no epoch has truth, as the truth does not overlap with the ranges in time: {where}, "
             f"{apart:.4g} s apart{hints}"
         )
     gaps = [f"{np.diff(t).min():.4g} s" if len(t) > 1 else "one pose" for t in (truth.times, times)]
     raise ValueError(
-        f"no epoch has truth: gaps above {gap_s:g} s are not bridged, and the shortest are "
+        f"no epoch has truth, as gaps above {gap_s:g} s are not bridged; the shortest gaps are "
         f"{gaps[0]} in the truth and {gaps[1]} in the ranges ({where}); see --truth-gap-s{hints}"
     )
 
@@ -106,7 +106,7 @@ def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
                 if 0.2 < value * scale < 5:
                     yield (
                         f"the stamps of the {name} look like {unit}: they span {value:.3g} times "
-                        "what the others span"
+                        "as long as the others"
                     )
                     return
     if step >= _LONG_STEP_S:
@@ -196,7 +196,7 @@ def fault_hints(
                 best = left, text, other
         if best is None:
             break
-        hints.append(f"{best[1]}: the errors would be {best[2].rmse()} in place of {judged.rmse()}")
+        hints.append(f"{best[1]}: the errors would be {best[2].rmse()} instead of {judged.rmse()}")
         judged, faults = best[2], []
     return hints
 
@@ -220,11 +220,11 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
         if not judged.has_rotation
         else (
             (
-                "the truth's quaternions look like x, y, z, w under the names w, x, y, z",
+                "the truth's quaternions look like x, y, z, w in columns named w, x, y, z",
                 rotations.from_quaternion(q[..., [3, 0, 1, 2]]),
             ),
             (
-                "the truth's quaternions look like w, x, y, z under the names x, y, z, w",
+                "the truth's quaternions look like w, x, y, z in columns named x, y, z, w",
                 rotations.from_quaternion(q[..., [1, 2, 3, 0]]),
             ),
             (
@@ -240,7 +240,7 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
         # A path that shrinks to a point fits everywhere.
         if scale * spread[1] < 0.3 * spread[0]:
             continue
-        yield f"the truth's places look like {unit}", judged._replace(true_translation=moved)
+        yield f"the truth's positions look like {unit}", judged._replace(true_translation=moved)
 
 
 def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:

@@ -103,7 +103,9 @@ def tune(
     seconds = check_number("seconds", seconds, low=1e-6)
     count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
     if count < 10:
-        raise ValueError(f"the first {seconds:g} s must have 10 epochs to tune by, got {count}")
+        raise ValueError(
+            f"the first {seconds:g} s must have at least 10 epochs for tuning, got {count}"
+        )
     given = local_trial(cut(recording, slice(count)), settings)
     ranges = given.recording.links.sum()
     before = float(evidence([given]).log_likelihood.sum() / ranges)

@@ -59,8 +59,8 @@ def env_frames(
         raise ValueError(f"env must be a gymnasium.Env, got {env!r:.80}")
     if world_of(env) is None and not places_anchors(env) and env.render_mode != "rgb_array":
         raise ValueError(
-            f"env tracks no body and places no anchors: make it with render_mode='rgb_array' to "
-            f"see it, got {env!r:.80}"
+            "env must track a body or place anchors, or have render_mode='rgb_array', got "
+            f"{env!r:.80}"
         )
     return _frames(env, filters, seed, act)
 
