@@ -136,7 +136,9 @@ def names(text: str) -> list[str]:
     """Parse different names with commas; a comma inside brackets is part of a name."""
     found = [name.strip() for name in re.split(r",(?![^\[]*\])", text)]
     if "" in found or len(set(found)) < len(found):
-        raise argparse.ArgumentTypeError(f"must be different names with commas, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"must be different names separated by commas, got {text!r}"
+        )
     return found
 
 
