@@ -413,8 +413,8 @@ def test_truth_from_a_tree_of_frames(tmp_path, capsys):
     assert [float(row["x"]) for row in rows] == [0, 1, 2]
     assert float(rows[2]["qz"]) == np.sin(0.2)
     assert main(["convert", str(log), *options, "/tf,parent=world,child=bose"]) == 2
-    said = "[truth] nothing is left: 3 dropped, transforms[].child_frame_id is base; 3 dropped, "
-    assert said + "transforms[].child_frame_id is camera" in capsys.readouterr().err
+    said = "[truth] no message can be used: 3 dropped, transforms[].child_frame_id is base; "
+    assert said + "3 dropped, transforms[].child_frame_id is camera" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("keep", [False, True])
@@ -509,7 +509,7 @@ def test_clocks_that_differ_and_stamps_that_are_missing(tmp_path):
     result = recordings.convert_bag(log, tmp_path / "out", {"ranges": MINE})
     notes = " ".join(result["notes"])
     assert "imu: the messages have no stamps, so the times of recording are used" in notes
-    assert "stamps are behind the recording by: ranges 3.000 s, imu 0.000 s" in notes
+    assert "stamps are behind the times of recording: ranges 3.000 s, imu 0.000 s" in notes
     assert read_csv(tmp_path / "out" / "imu.csv")[1]["t"] == "1700000000.000000001"
 
 
@@ -582,8 +582,11 @@ def test_topics_and_fields_are_listed(small, capsys):
     ("mapping", "message"),
     [
         ({}, r"no topic has a known type of ranges.*/uwb \(my_uwb/msg/Range\)"),
-        ({"ranges": {"topic": "/uwb"}}, "my_uwb/msg/Range: say where anchor, tag, range stands"),
-        ({"ranges": {**MINE, "topic": "/x"}}, r"no topic '/x', there are /uwb"),
+        (
+            {"ranges": {"topic": "/uwb"}},
+            "my_uwb/msg/Range: give the field paths of anchor, tag, range",
+        ),
+        ({"ranges": {**MINE, "topic": "/x"}}, r"no topic '/x', the topics are /uwb"),
         (
             {"ranges": {**MINE, "range": "dist"}},
             r"topic /uwb, \[ranges\]: no field 'dist', there is header, here, there, range_mm",

@@ -115,8 +115,8 @@ def test_what_does_not_determine_the_pose_is_refused_with_its_rank():
     ("value", "message"),
     [
         (np.full((2, 4), np.nan), "angles must be finite"),
-        (np.full((2, 4), 45.0), "angles must be radians on"),
-        (np.full((2, 4), -0.2), "angles must be radians on"),
+        (np.full((2, 4), 45.0), "angles must be angles in radians on"),
+        (np.full((2, 4), -0.2), "angles must be angles in radians on"),
         (np.zeros((2, 3)), "angles must have shape"),
     ],
 )

@@ -479,8 +479,8 @@ def test_the_schema_refuses_what_the_reader_refuses_by_form():
     rule = schema()
     # What only geometry or other tables can tell.
     deeper = re.compile("cross or touch|different points|one of .materials|either material|lie "
-                        "below|inside an obst|counts the|from|free place|must differ|means "
-                        "nothing|at most|finite, got|1e\\+06 m|no legal|legal points|not be empty|"
+                        "below|inside an obst|includes the|from|free place|must differ|needs|"
+                        "no effect|at most|finite, got|1e\\+06 m|permitted|not be empty|"
                         "axis|either .region|slabs|must be given")  # fmt: skip
     checked = 0
     for path, value, message in BAD:

@@ -131,7 +131,7 @@ def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     out, plot = tmp_path / "out", tmp_path / "links.png"
     how = ["--planar", "--arms", "held", "--harmonics", "3", "--time-offset", "0"]
     assert main(["calibrate", *logs, *how, "--out", str(out), "--plot", str(plot)]) == 0
-    assert "harmonics at the tags, of each by itself" in capsys.readouterr().out
+    assert "harmonics at the tags, separate for each antenna" in capsys.readouterr().out
     assert plot.stat().st_size > 10_000
     got = read_directions(out / "directions.csv", (tuple("012345"), tuple("0123")))
     np.testing.assert_allclose(got.tags[:, 2:], law.tags[:, 2:], atol=0.012)

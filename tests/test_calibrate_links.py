@@ -242,7 +242,7 @@ def test_spread_of_residuals_leaves_biases_out():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"truth": None}, "calibrated by truth"),
+        ({"truth": None}, "calibrated by the truth"),
         ({"rotation": None}, "must have rotations"),
         ({"planar": True}, "set planar"),
         ({"late": 100.0}, "no range has truth"),
@@ -289,7 +289,7 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
     figures = json.loads(capsys.readouterr().out)
     assert len(figures["nodes"]) == 10
     assert main(["calibrate", *arguments, "--calibration", str(out / "calibration.csv")]) == 2
-    assert "without --calibration" in capsys.readouterr().err
+    assert "leave out --calibration" in capsys.readouterr().err
     assert main(["calibrate", *arguments, "--start", "ranges"]) == 2
     assert "--start must be left out with --truth" in capsys.readouterr().err
 

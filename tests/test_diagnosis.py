@@ -92,7 +92,7 @@ WORDS = {
     "a link": "the ranges from anchor A3 to tag T1 look 0.8",
     "an anchor": "anchor A2 looks misplaced",
     "deviation": "try --range-std-m 0.1",
-    "walk": "--walk-m 0.3 --walk-deg 20 or so",
+    "walk": "try --walk-m 0.3 --walk-deg 20",
 }
 
 

@@ -303,7 +303,7 @@ def test_derivatives_of_the_costs_by_finite_differences():
         ({"tags": TAGS[:2], "angles": np.ones((2, 2))}, "tags must be at least 3"),
         ({"tags": TAGS[[0, 1, 1, 0]]}, "tags must be at least 3 and not collinear"),
         ({"angles": np.full((2, 4), np.nan)}, "angles must be finite"),
-        ({"angles": np.full((2, 4), 90.0)}, "angles must be radians"),
+        ({"angles": np.full((2, 4), 90.0)}, "angles must be angles in radians"),
         ({"station": [1.0, 2.0]}, "station must have shape"),
         ({"distance_weight": 0.0}, "distance_weight must be"),
         ({"half_space": ["y>0"]}, "half_space must be"),

@@ -160,10 +160,12 @@ def test_filterpy_by_name_refuses_a_batch():
         "kf", tags=bodies.pyramid(), noise=NOISE, process=PROCESS, engine="filterpy"
     )
     state = filter.initial(np.eye(3), np.zeros((4, 3)), np.eye(6))
-    with pytest.raises(ValueError, match=r"tracks one body, got a state with leading axes \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"tracks only one body, got a state with leading axes \(4,\)"
+    ):
         filter.predict(state, np.zeros(6), 1.0)
     state = filter.initial(np.eye(3), np.zeros(3), np.eye(6))
-    with pytest.raises(ValueError, match="tracks one body, got a twist"):
+    with pytest.raises(ValueError, match="tracks only one body, got a twist"):
         filter.predict(state, np.zeros((2, 6)), 1.0)
     with pytest.raises(ValueError, match="engine must be one of"):
         estimators.make("kf", tags=TAGS["plate"], noise=NOISE, process=PROCESS, engine="torch")

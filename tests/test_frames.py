@@ -160,7 +160,7 @@ def test_one_node_and_two():
             {"known_pair": None},
             "either known_pair or ranges must be given, for the scale; got neither",
         ),
-        ({"ranges": np.ones(5), "range_std_m": 0.1}, "the scale, got both"),
+        ({"ranges": np.ones(5), "range_std_m": 0.1}, "the scale; got both"),
         ({"length_m": None}, "length_m must be a number"),
         ({"length_m": -1.0}, "length_m must be"),
         ({"known_pair": (1, 1)}, "two different nodes"),

@@ -377,9 +377,9 @@ def test_a_log_is_read_in_its_units(tmp_path):
         (ROWS, {"columns": {"wx": "gx"}}, "line 1: missing column 'gx'"),
         (ROWS, {"columns": {"gx": "wx"}}, "columns must be one of 't', 'wx'"),
         (ROWS, {"turn_unit": "rpm"}, "turn_unit must be one of 'rad/s', 'deg/s'"),
-        (ROWS, {"force_unit": "g"}, r"9.81 g, of a log in g \(looks like m/s\^2\?"),
+        (ROWS, {"force_unit": "g"}, r"9.81 g, which does not fit a log in g \(is it in m/s\^2\?"),
         ([(t, *w, *np.array(a) / G) for t, *w, a in [(r[0], *r[1:4], r[4:]) for r in ROWS]], {},
-         "looks like g, or gravity"),
+         "is it in g, or was gravity"),
         ([(r[0], 200, 0, 0, *r[4:]) for r in ROWS], {}, r"if it is in deg/s"),
     ],
 )  # fmt: skip

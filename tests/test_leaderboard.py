@@ -293,7 +293,7 @@ def test_a_filter_that_cannot_observe_is_a_row_with_its_rank(tmp_path, capsys):
         6,
     )
     table = capsys.readouterr().out
-    assert "kf: cannot observe this scene, rank 8 of 12" in table
+    assert "kf: does not determine the pose in this scene, rank 8 of 12" in table
     assert "kf, lost-links: refused at epoch 0" in table
 
 
@@ -573,8 +573,8 @@ def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, cap
             "must have the key 'name' of a scene, or the files of",
         ),
         ("steps = 3", "must have the key 'name' of a scene, or the files of"),
-        ('ranges = "ranges.csv"\nspeed = 3', "walk.toml: a recording has no 'speed'"),
-        ('ranges = "ranges.csv"\nanchors = "a.csv"', "walk.toml: a recording needs 'tags'"),
+        ('ranges = "ranges.csv"\nspeed = 3', "walk.toml: a recording has no key 'speed'"),
+        ('ranges = "ranges.csv"\nanchors = "a.csv"', "walk.toml: a recording needs the key 'tags'"),
         ("ranges = 3", "walk.toml: ranges must be the name of a file, got 3"),
         ('name = "uwb_room"\nstep = 3', "walk.toml: scene has no field 'step'"),
         ("ranges = ", "walk.toml: Invalid value"),

@@ -346,7 +346,7 @@ def test_everything_broadcasts():
          "noise must be a noise law of rbl_gym.ranging, got 0.1"),
         (lambda w: bounds.posterior_step(
             np.eye(8), bounds.RangeEpoch(*w, NOISE), None, bounds.Nuisances(bias=LinkBias(0.1))),
-         r"J must have shape \(..., 26, 26\) or .* with 20 states of nuisances, got \(8, 8\)"),
+         r"J must have shape \(..., 26, 26\) or .* with 20 nuisance states, got \(8, 8\)"),
         (lambda w: bounds.posterior_step(
             np.eye(6), bounds.RangeEpoch(*w, NOISE), bounds.KnownTwist(np.zeros(6), -1, PROCESS)),
          "dt must not be negative"),

@@ -349,7 +349,11 @@ def test_my_layout_is_judged(files, capsys):
     shown = capsys.readouterr().out
     assert shown.startswith(place_report.verdict(result))
     assert shown.split(":")[0] in ("PASS", "FAIL", "TOO CLOSE TO TELL")
-    for text in ("what each anchor is for", "one more would help most", "cost of the mounts"):
+    for text in (
+        "what each anchor is for",
+        "one more anchor would help most",
+        "cost of the mounts",
+    ):
         assert text in shown
 
 

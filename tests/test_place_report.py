@@ -131,7 +131,7 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (["plan", "x.png"], "x.png: a picture needs --metres-per-pixel or --width"),
+        (["plan", "x.png"], "x.png: a picture needs either --metres-per-pixel or --width"),
         (["plan", "nowhere.geojson"], "nowhere.geojson: No such file or directory"),
         (["plan", "x.dwg"], "x.dwg: DWG files cannot be read: save the drawing as DXF"),
         (["plan", "x.png", "--walls", "A"], "a picture has no layers: leave out --walls"),

@@ -405,7 +405,7 @@ def test_bad_calls_are_named():
     env = AnchorPlacementVectorEnv(2, autoreset_mode="Disabled", n_anchors=1)
     with pytest.raises(ResetNeeded):
         env.step(np.zeros((2, 3)))
-    with pytest.raises(ResetNeeded, match="reset all environments"):
+    with pytest.raises(ResetNeeded, match="all environments before"):
         env.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(ValueError, match="seed must hold 2 seeds, got"):
         env.reset(seed=[1, 2, 3])

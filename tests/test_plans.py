@@ -361,7 +361,7 @@ def test_a_picture_gives_its_rectangle(tmp_path):
     assert close(made.tables["mounts"][0]["polygon"], [(1, 2), (13, 2), (13, 10), (1, 10)])
     assert made.tables["mounts"][0]["height_m"] == 2.8
     bad = tmp_path / "bad.png"
-    bad.write_text("no picture")
+    bad.write_text("not a picture")
     with pytest.raises(ValueError, match=r"bad\.png: not a picture"):
         pictures.backdrop(str(bad), 0.05)
     with pytest.raises(ValueError, match="metres_per_pixel must be positive"):

@@ -193,11 +193,11 @@ ERRORS = {
     "empty coordinate": ({"tags": "tag,x,y,z\n1,0,,0\n"}, r"tags.csv, line 2, column 'y': .*''"),
     "unknown anchor": (
         {"ranges": LONG.replace("B", "E")},
-        r"ranges.csv, line 5, column 'anchor': unknown anchor, must be of \('A', .*, got 'E'",
+        r"ranges.csv, line 5, column 'anchor': unknown anchor, must be one of \('A', .*, got 'E'",
     ),
     "unknown tag": (
         {"calibration": CALIBRATION.replace("C,1", "C,2")},
-        r"calibration.csv, line 3, column 'tag': unknown tag, must be of \('1', .*, got '2'",
+        r"calibration.csv, line 3, column 'tag': unknown tag, must be one of \('1', .*, got '2'",
     ),
     "duplicate id": (
         {"anchors": ANCHORS + "A,9,9,9\n"},

@@ -205,9 +205,11 @@ def test_replays():
 
 
 def test_benchmarks():
-    with pytest.raises(ValueError, match="condition noise-x2 cannot double"):
+    with pytest.raises(ValueError, match="condition 'noise-x2' cannot double"):
         worlds._noisier(ranging.LinkModel(), 2.0)
-    with pytest.raises(Exception, match="must be different names with commas, got 'kf,,iekf'"):
+    with pytest.raises(
+        Exception, match="must be different names separated by commas, got 'kf,,iekf'"
+    ):
         bench_command._names("kf,,iekf")
     with pytest.raises(ValueError, match="--scenes: two are named 'hall': rename a file"):
         spec_files.scene_specs(["hall", "hall"])

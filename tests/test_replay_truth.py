@@ -84,7 +84,7 @@ def test_sparse_poses_are_compared_exactly_and_dense_ones_as_they_were():
 
 def test_gaps_in_both_are_named():
     ranges, truth = np.arange(0, 10, 1.0), Truth(*moving(1.0, start_s=0.5))
-    with pytest.raises(ValueError, match=r"gaps above 0.5 s are not bridged, .* 1 s in the truth "
+    with pytest.raises(ValueError, match=r"gaps above 0.5 s are not bridged; .* 1 s in the truth "
                                          r"and 1 s in the ranges .*--truth-gap-s"):  # fmt: skip
         check_overlap(truth, ranges, 0.5)
     check_overlap(truth, ranges, 1.0)
@@ -141,7 +141,7 @@ FAULTS = {
     "world to body": (
         Truth(TIMES, np.swapaxes(moving(0.05)[1], 1, 2), PLACE), "rotations look inverted",
     ),
-    "centimetres": (Truth(TIMES, moving(0.05)[1], 100 * PLACE), "places look like centimetres"),
+    "centimetres": (Truth(TIMES, moving(0.05)[1], 100 * PLACE), "positions look like centimetres"),
     "late": (transformed(late_s=0.3), r"stamps look about 0.(25|30|35) s late"),
     "early": (transformed(late_s=-0.4), r"stamps look about 0.(35|40|45) s early"),
     "shift": (transformed(shift=(5, -2, 0.3)), r"world frame, turned by \(.*shifted by \(-5\.0"),

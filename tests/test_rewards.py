@@ -132,7 +132,7 @@ def test_a_named_reward_survives_the_spec_as_json():
     [
         ("gold", "reward must be one of 'belief', 'error', 'worst-tag', 'requirement', .*'gold'"),
         ("requirement", "reward 'requirement' needs limits"),
-        ({"kind": "requirement"}, "needs position_m, rotation_deg or both"),
+        ({"kind": "requirement"}, "needs position_m or rotation_deg, or both"),
         ({"position_m": 1.0}, "reward must have a kind, one of .*, got None"),
         ({"kind": "belief", "position_m": 1.0}, "reward 'belief' has no option 'position_m'"),
         ({"kind": "belief", "action_price": -1.0}, "reward.action_price must be .*got -1"),

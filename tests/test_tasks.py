@@ -535,7 +535,11 @@ def test_other_scenes_give_finite_observations(kind, scene):
         (0, {"scene": 3}, "scene must be a name or a dict"),
         (0, {"scene": ["auv_craft"]}, "scene must be a name or a dict"),
         (0, {"scene": {"steps": 3}}, "scene must be a name or a dict"),
-        (0, {"scene": {"name": "auv_craft", "anchor_speed_m_s": 0}}, "scene must have anchors"),
+        (
+            0,
+            {"scene": {"name": "auv_craft", "anchor_speed_m_s": 0}},
+            "scene must have moving anchors",
+        ),
         (0, {"scene": {"name": "auv_craft", "colour": 1}}, "scene has no field 'colour'"),
         (0, {"sort_craft": "no"}, "sort_craft must be True or False, got 'no'"),
         (0, {"render_mode": "human"}, "render_mode must be None"),

@@ -84,7 +84,9 @@ def test_what_a_track_does_not_have_is_not_written(tmp_path):
 
 
 def test_what_is_wrong_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"track\.json: a track must end in \.tum or \.txt"):
+    with pytest.raises(
+        ValueError, match=r"track\.json: the name of a track must end in \.tum or \.txt"
+    ):
         check_track_path(tmp_path / "track.json")
     with pytest.raises(ValueError, match=r"must end in"):
         write_track(tmp_path / "track", track())

@@ -130,7 +130,7 @@ def test_every_way_to_train_makes_a_policy_that_plays(monkeypatch, tmp_path, tas
 @pytest.mark.parametrize(
     ("task", "algorithm", "message"),
     [
-        ("auv_buoys", "set-ppo", r"is for RBL/MobileAnchors-v0, the task is of RBL/AnchorPlace"),
+        ("auv_buoys", "set-ppo", r"is for RBL/MobileAnchors-v0, got a task of RBL/AnchorPlace"),
         ("craft", "supervised", r"is for RBL/AnchorSelection-v0"),
         ("craft", "maskable-ppo", "is for tasks with discrete actions"),
         ("craft", "nix", "algorithm must be one of"),

@@ -51,7 +51,7 @@ def headline(result: dict[str, Any]) -> str:
         words = {
             "pass": "the zone meets its requirement",
             "fail": "the zone does not meet its requirement",
-            "undecided": "undecided: too close to the required share",
+            "undecided": "too close to the requirement to tell",
         }[overall]
         return f"{count}: {words}"
     if met == len(asked):

@@ -124,11 +124,10 @@ def _add_filter(group: Any) -> None:
         "--range-std-m",
         "standard deviation of a range, metres; default: that of the recording, else 0.12",
     )
-    # Of 0.1: --filter NAME/robust=false.
+    # As in version 0.1; now --filter NAME/robust=false.
     group.add_argument(
         "--no-robust", dest="robust", action="store_false", default=None, help=argparse.SUPPRESS
     )
-    _add_number(group, "--range-std-m", "of a range; default the recording's own, else 0.12")
 
 
 def _add_motion(group: Any) -> None:
