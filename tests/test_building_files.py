@@ -384,7 +384,7 @@ BAD = [
     ("zones.0.share", 1, "zones[0].share must be a finite number in [0.01, 0.9999]"),
     ("zones.1.position_m", None, "zones[1].share needs one of position_m, height_m"),
     ("zones.0.attitude", "up", "zones[0].attitude must be one of 'free', 'level', 'heading'"),
-    ("zones.1.name", "open plan", "zones[1].name must differ from the names of the others"),
+    ("zones.1.name", "open plan", "zones[1].name must differ from the names of the other zones"),
     ("plan", {"images": "x"}, "plan has an unknown key 'images'"),
     ("plan", {"metres_per_pixel": 0}, "plan.metres_per_pixel must be a finite number"),
     ("plan", {"image": "a.png"}, "plan.metres_per_pixel must be given with plan.image"),

@@ -150,7 +150,7 @@ def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     assert main(["replay", *logs, "--planar", *wrong]) == 2
     assert "only the filters iekf-log" in capsys.readouterr().err
     assert main(["calibrate", *logs[:8], *wrong[2:]]) == 2
-    assert "without --directions" in capsys.readouterr().err
+    assert "leave out --directions" in capsys.readouterr().err
 
 
 def test_the_clock_of_a_gyroscope_with_a_bias():

@@ -152,8 +152,8 @@ def test_good_obstacles_come_back_as_arrays():
         ([1, 2, 3, 4, 5, 6], "obstacles must have shape (..., K, 6), got (6,)"),
         (np.ones((2, 1, 6)), "obstacles must have shape (K, 6), got (2, 1, 6)"),
         ([[0, 0, np.nan, 1, 1, 1]], "obstacles must be finite, got nan at index (0, 2)"),
-        ([[0, 0, 0, 1, 0, 1]], "half sizes of obstacles must be positive, got 0 m"),
-        ([[0, 0, 0, 1, -2, 1]], "half sizes of obstacles must be positive, got -2 m"),
+        ([[0, 0, 0, 1, 0, 1]], "obstacles must have positive half sizes, got 0 m"),
+        ([[0, 0, 0, 1, -2, 1]], "obstacles must have positive half sizes, got -2 m"),
         ("rack", "obstacles must be an array of real numbers"),
     ],
 )

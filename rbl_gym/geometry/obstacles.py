@@ -206,7 +206,7 @@ def check_obstacles(obstacles: object) -> FloatArray:
     if array.ndim != 2:
         raise ValueError(f"obstacles must have shape (K, 6), got {array.shape}")
     if (array[:, 3:] <= 0).any():
-        raise ValueError(f"half sizes of obstacles must be positive, got {array[:, 3:].min():g} m")
+        raise ValueError(f"obstacles must have positive half sizes, got {array[:, 3:].min():g} m")
     return array
 
 
