@@ -182,7 +182,9 @@ def parse_filter(text: str, options: Mapping[str, Any] | None = None) -> tuple[s
     for part in parts:
         key, equals, value = part.partition("=")
         if not key or not equals:
-            raise ValueError(f"filter {text!r:.80} must be name/option=value/..., got {part!r}")
+            raise ValueError(
+                f"filter {text!r:.80} must have the form name/option=value/..., got {part!r}"
+            )
         if key in result:
             raise ValueError(f"filter {text!r:.80} has the option {key!r} twice")
         try:

@@ -79,7 +79,11 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
         ("kf", {"noise": 0.1}, "noise must have variance and squared_range_variance, got 0.1"),
         ("kf", {"process": None}, "process must have covariance and std"),
         ("iekf", {"tags": np.zeros((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
-        ("iekf/robust", {}, "filter 'iekf/robust' must be name/option=value/..., got 'robust'"),
+        (
+            "iekf/robust",
+            {},
+            "filter 'iekf/robust' must have the form name/option=value/..., got 'robust'",
+        ),
         ("iekf/robust=true/robust=late", {}, "has the option 'robust' twice"),
         ("iekf/robust=true", {"robust": True}, "has the option 'robust' twice"),
         ("iekf/tags=3", {}, "filter 'iekf' has no option 'tags'; it has"),

@@ -436,7 +436,7 @@ def test_the_verdict_says_what_to_do_next():
         (["--layout", "LAYOUT", "--anchors", "7"], "--anchors with --layout needs --optimise"),
         (["--layout", "LAYOUT", "--optimise", "--keep", "z"], "--keep must name anchors"),
         (["--layout", "LAYOUT", "--optimise", "--anchors", "5"], "must be at least 6"),
-        (["--anchors", "11"], "too few for 11 anchors"),
+        (["--anchors", "11"], "too few for the 11 anchors"),
     ],
 )  # fmt: skip
 def test_what_does_not_go_together_is_said(files, options, message, capsys):

@@ -206,7 +206,7 @@ ERRORS = {
     "empty id": ({"tags": TAGS + ",0,0,0\n"}, r"tags.csv, line 4, column 'tag': .* be empty"),
     "calibration twice": (
         {"calibration": CALIBRATION + "A,1,0,0,0\n"},
-        r"calibration.csv, line 4, column 'tag': each link may come once .*, got \('A', '1'\)",
+        r"calibration.csv, line 4, column 'tag': each link must be .*, got \('A', '1'\)",
     ),
     "time falls": (
         {"ranges": LONG + "-1.05,A,1,1\n"},

@@ -212,7 +212,7 @@ class Standstill(Wrapped):
     ("broken", "check", "message"),
     [
         (NoBelief, "interface", "must have the method 'belief', but NoBelief has not"),
-        (OneBody, "shapes", r"initial must take .* raised IndexError\('too many bodies'\)"),
+        (OneBody, "shapes", r"initial must accept .* raised IndexError\('too many bodies'\)"),
         (FlatCovariance, "shapes", r"belief.covariance must be .* \(6, 6\), got float64 \(36,\)"),
         (Single, "shapes", r"belief.translation must be a float64 array .* got float32"),
         (Skewed, "pose", "belief.rotation must be orthogonal, but Q Q.T differs from I by 0.0201"),
@@ -235,7 +235,7 @@ class Standstill(Wrapped):
             "an anchor whose links are all False must have no influence, even with 0",
         ),
         (ForgetsWhereNothingIs, "links", "an epoch without links must not change the belief"),
-        (OfTheOldInterface, "noise", r"update\(..., noise=None\) must take .* raised TypeError"),
+        (OfTheOldInterface, "noise", r"update\(..., noise=None\) must accept .* raised TypeError"),
         (DeafToNoise, "noise", "the same as a filter made with this RangeNoise: .* differs by"),
         (
             TakesTheMeanNoise,
