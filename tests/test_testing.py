@@ -314,7 +314,7 @@ def writes_links(ranges, anchors, tags, noise, links=None):
         (cannot_batch, "batching", "trial 0: translation differs"),
         (writes_links, "purity", r"locate must not change its arguments, but changed argument 4"),
         (partial(located, change=lambda p: p._replace(translation=0.9 * p.translation)),
-         "invariance", "must move and turn the estimate by as much: translation differs"),
+         "invariance", "must move and turn the estimate: translation differs"),
         (forgets_links, "links", "an anchor whose links are all False"),
         (swallows_nan, "nan", "locate must raise a ValueError on NaN in anchors"),
         (partial(located, change=lambda p: p._replace(covariance=10 * p.covariance)),

@@ -60,10 +60,7 @@ def verdict(result: dict[str, Any]) -> str:
         how = "--optimise" if "given" in result["layouts"] else "--fewest"
         return f"{text} Try {how}, or more --anchors." if result["verdict"] == "fail" else text
     if not fewest["met"]:
-        return (
-            f"{text} No layout was found that meets them: allow more anchors, or relax the "
-            "requirements."
-        )
+        return f"{text} No layout was found that passes: allow more anchors, or require less."
     less = fewest["one_less"]
     if less is None:
         return f"{text} This is the least number that was allowed."
@@ -252,10 +249,8 @@ def _next(result: dict[str, Any]) -> Rows:
             ]
         )
     where = ", ".join(f"{more[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
-    title = (
-        f"one more anchor would help most at ({where}), {more['mount']}: b changes by a "
-        f"factor of {more['ratio']:.3f}"
-    )
+    change = f"b changes by a factor of {more['ratio']:.3f}"
+    title = f"one more anchor would help most at ({where}), {more['mount']}: {change}"
     headings = [
         "zone", "verdict", "within now", "then", "position RMS (m) now", "then",
         "heading RMS (deg) now", "then",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
@@ -61,12 +61,10 @@ def _add_knowledge(group: Any) -> None:
         default=None,
         help="the body moves in a plane: height, roll and pitch are held",
     )
-    _add_number(
-        group,
-        "--height-offset-m",
-        "with --planar: depth of the tags below the anchors (difference of the mean heights), "
-        "metres; default 0 if all anchors have the same height",
-    )
+    _add_numbers(group, (
+        ("height-offset-m", "with --planar: depth of the tags below the anchors (difference of "
+         "the mean heights), metres; default 0 if all anchors have the same height"),
+    ))  # fmt: skip
     group.add_argument(
         "--volume",
         type=_volume,
@@ -88,27 +86,15 @@ def _add_knowledge(group: Any) -> None:
         help="first position of the body's origin, metres, and its heading; write --start=-1,... "
         "if the first number is negative",
     )
-    _add_number(
-        group, "--prior-position-m", "standard deviation of the first position, metres, default 0.5"
-    )
-    _add_number(
-        group,
-        "--prior-rotation-deg",
-        "standard deviation of the first rotation, degrees; default 30 with a yaw in "
-        "--start, else unknown",
-    )
-    _add_number(
-        group,
-        "--height-m",
-        "height of the body's origin, metres; held exactly with --planar, else within "
-        "--height-std-m",
-    )
-    _add_number(group, "--height-std-m", "standard deviation of --height-m, metres")
-    _add_number(
-        group,
-        "--tilt-std-deg",
-        "the body stays level: standard deviation of roll and pitch, degrees",
-    )
+    _add_numbers(group, (
+        ("prior-position-m", "standard deviation of the first position, metres, default 0.5"),
+        ("prior-rotation-deg", "standard deviation of the first rotation, degrees; default 30 "
+         "with a yaw in --start, else unknown"),
+        ("height-m", "height of the body's origin, metres; held exactly with --planar, else "
+         "within --height-std-m"),
+        ("height-std-m", "standard deviation of --height-m, metres"),
+        ("tilt-std-deg", "the body stays level: standard deviation of roll and pitch, degrees"),
+    ))  # fmt: skip
 
 
 def _add_filter(group: Any) -> None:
@@ -119,11 +105,10 @@ def _add_filter(group: Any) -> None:
         "--bias-..., iekf-imu with --imu; default of robust: late for iekf-log and iekf-imu, "
         "else true",
     )
-    _add_number(
-        group,
-        "--range-std-m",
-        "standard deviation of a range, metres; default: that of the recording, else 0.12",
-    )
+    _add_numbers(group, (
+        ("range-std-m", "standard deviation of a range, metres; default: that of the recording, "
+         "else 0.12"),
+    ))  # fmt: skip
     # As in version 0.1; now --filter NAME/robust=false.
     group.add_argument(
         "--no-robust", dest="robust", action="store_false", default=None, help=argparse.SUPPRESS
@@ -131,28 +116,15 @@ def _add_filter(group: Any) -> None:
 
 
 def _add_motion(group: Any) -> None:
-    _add_number(
-        group,
-        "--walk-m",
-        "random walk of the position: standard deviation after 1 s, metres, default 0.1",
-    )
-    _add_number(
-        group,
-        "--walk-deg",
-        "random walk of the rotation: standard deviation after 1 s, degrees, default 7",
-    )
-    _add_number(
-        group,
-        "--accel-m",
-        "iekf-log, iekf-cv: standard deviation of the change of speed after 1 s, m/s; default 1 "
-        "and 0.5",
-    )
-    _add_number(
-        group,
-        "--accel-deg",
-        "iekf-log, iekf-cv: standard deviation of the change of turn rate after 1 s, deg/s; "
-        "default 30",
-    )
+    _add_numbers(group, (
+        ("walk-m", "random walk of the position: standard deviation after 1 s, metres, default 0.1"),
+        ("walk-deg", "random walk of the rotation: standard deviation after 1 s, degrees, default "
+         "7"),
+        ("accel-m", "iekf-log, iekf-cv: standard deviation of the change of speed after 1 s, m/s; "
+         "default 1 and 0.5"),
+        ("accel-deg", "iekf-log, iekf-cv: standard deviation of the change of turn rate after 1 "
+         "s, deg/s; default 30"),
+    ))  # fmt: skip
 
 
 def _add_tuning(group: Any) -> None:
@@ -163,41 +135,27 @@ def _add_tuning(group: Any) -> None:
         "estimated) by the likelihood of the first part of the log; without --filter also "
         "the filter, or iekf-bias with --calibration. The truth is not used",
     )
-    _add_number(group, "--tune-s", "length of this first part, seconds, default 20; implies --tune")
+    _add_numbers(group, (
+        ("tune-s", "length of this first part, seconds, default 20; implies --tune"),
+    ))  # fmt: skip
 
 
 def _add_biases(group: Any) -> None:
-    for name, text in (
-        (
-            "constant-std-m",
-            "iekf-log: standard deviation of the constant bias of a link, metres, default 0.05",
-        ),
-        (
-            "constant-common-m",
-            "iekf-log: standard deviation of the constant bias common to all links, metres, "
-            "default 0.1",
-        ),
-        (
-            "drift-std-m",
-            "iekf-log: standard deviation of the drifting bias of a link, metres, default 0.05",
-        ),
+    _add_numbers(group, (
+        ("constant-std-m", "iekf-log: standard deviation of the constant bias of a link, metres, "
+         "default 0.05"),
+        ("constant-common-m", "iekf-log: standard deviation of the constant bias common to all "
+         "links, metres, default 0.1"),
+        ("drift-std-m", "iekf-log: standard deviation of the drifting bias of a link, metres, "
+         "default 0.05"),
         ("drift-time-s", "iekf-log: correlation time of the drifting bias, seconds, default 3"),
-        (
-            "bias-std-m",
-            "iekf-bias: standard deviation of the bias of a link, metres, default 0.02, with "
-            "--raw 0.05",
-        ),
-        (
-            "bias-time-s",
-            "iekf-bias: correlation time of this bias, seconds, default 3, with --raw constant",
-        ),
-        (
-            "bias-common-m",
-            "iekf-bias: standard deviation of the bias common to all links, metres, default 0, "
-            "with --raw 0.1",
-        ),
-    ):
-        _add_number(group, f"--{name}", text)
+        ("bias-std-m", "iekf-bias: standard deviation of the bias of a link, metres, default "
+         "0.02, with --raw 0.05"),
+        ("bias-time-s", "iekf-bias: correlation time of this bias, seconds, default 3, with "
+         "--raw constant"),
+        ("bias-common-m", "iekf-bias: standard deviation of the bias common to all links, metres, "
+         "default 0, with --raw 0.1"),
+    ))  # fmt: skip
     group.add_argument(
         "--raw",
         action="store_true",
@@ -212,43 +170,25 @@ def _add_smoothing(group: Any) -> None:
         default=None,
         help="compute the most likely track from the whole log, in addition to the causal one",
     )
-    _add_number(
-        group,
-        "--smooth-accel-m",
-        "standard deviation of the change of speed after 1 s, m/s, default 0.2",
-    )
-    _add_number(
-        group,
-        "--smooth-accel-deg",
-        "standard deviation of the change of turn rate after 1 s, deg/s, default 15",
-    )
-    _add_number(
-        group,
-        "--smooth-bias-std-m",
-        "standard deviation of the drifting bias of a link, metres, default 0.06",
-    )
-    _add_number(
-        group, "--smooth-bias-time-s", "correlation time of the drifting bias, seconds, default 3"
-    )
-    _add_number(
-        group,
-        "--smooth-constant-m",
-        "standard deviation of the constant bias of a link, metres, default 0.1",
-    )
-    _add_number(
-        group,
-        "--smooth-common-m",
-        "standard deviation of the constant bias common to all links, metres, default 0.2",
-    )
+    _add_numbers(group, (
+        ("smooth-accel-m", "standard deviation of the change of speed after 1 s, m/s, default 0.2"),
+        ("smooth-accel-deg", "standard deviation of the change of turn rate after 1 s, deg/s, "
+         "default 15"),
+        ("smooth-bias-std-m", "standard deviation of the drifting bias of a link, metres, default "
+         "0.06"),
+        ("smooth-bias-time-s", "correlation time of the drifting bias, seconds, default 3"),
+        ("smooth-constant-m", "standard deviation of the constant bias of a link, metres, default "
+         "0.1"),
+        ("smooth-common-m", "standard deviation of the constant bias common to all links, metres, "
+         "default 0.2"),
+    ))  # fmt: skip
 
 
 def _add_comparison(group: Any) -> None:
-    _add_number(group, "--yaw-offset-deg", "yaw error = estimate - (truth + offset)")
-    _add_number(
-        group,
-        "--truth-gap-s",
-        "longest gap of truth or ranges that is interpolated, seconds, default 0.5",
-    )
+    _add_numbers(group, (
+        ("yaw-offset-deg", "yaw error = estimate - (truth + offset)"),
+        ("truth-gap-s", "longest gap of truth or ranges that is interpolated, seconds, default 0.5"),
+    ))  # fmt: skip
     group.add_argument(
         "--truth-exclude",
         type=window,
@@ -278,8 +218,9 @@ def _add_output(group: Any) -> None:
     add_json(group)
 
 
-def _add_number(group: Any, name: str, text: str) -> None:
-    group.add_argument(name, type=float, metavar="X", help=text)
+def _add_numbers(group: Any, texts: Iterable[tuple[str, str]]) -> None:
+    for name, text in texts:
+        group.add_argument(f"--{name}", type=float, metavar="X", help=text)
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -170,10 +170,7 @@ def _filter_determinism(make_filter: Any, rng: np.random.Generator) -> None:
     filter = _made(make_filter)
     epochs = _drawn(filter, rng, (3,), 3)
     first = _beliefs(filter, epochs)[-1]
-    for label, other in (
-        ("a second run", filter),
-        ("a second filter with the same arguments", _made(make_filter)),
-    ):
+    for label, other in (("a second run", filter), ("an equal filter", _made(make_filter))):
         check_same(f"{label} must give the same bytes", first, _beliefs(other, epochs)[-1], 0.0)
 
 
@@ -207,9 +204,7 @@ def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
     )
     expected = moved(_beliefs(filter, epochs)[-1], turn, shift)
     found = _beliefs(filter, elsewhere, anchors=ANCHORS @ turn.T + shift)[-1]
-    check_same(
-        "moving and turning the world must move and turn the belief by as much", expected, found
-    )
+    check_same("moving and turning the world must move and turn the belief", expected, found)
 
 
 def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
@@ -360,9 +355,7 @@ def _locator_invariance(locate: Any, rng: np.random.Generator) -> None:
     turn, shift = moved_world(rng)
     expected = moved(_located(locate, ranges), turn, shift)
     found = _located(locate, ranges, ANCHORS @ turn.T + shift)
-    check_same(
-        "moving and turning the world must move and turn the estimate by as much", expected, found
-    )
+    check_same("moving and turning the world must move and turn the estimate", expected, found)
 
 
 def _locator_links(locate: Any, rng: np.random.Generator) -> None:
