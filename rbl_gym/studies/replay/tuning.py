@@ -9,7 +9,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.replay.causes import cut, local_trial
+from rbl_gym.studies.replay.causes import local_trial
 from rbl_gym.studies.replay.evidence import Trial, evidence
 from rbl_gym.studies.replay.place import own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
@@ -104,7 +104,7 @@ def tune(
     count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
     if count < 10:
         raise ValueError(f"the first {seconds:g} s must have 10 epochs to tune by, got {count}")
-    given = local_trial(cut(recording, slice(count)), settings)
+    given = local_trial(recording.part(slice(count)), settings)
     ranges = given.recording.links.sum()
     before = float(evidence([given]).log_likelihood.sum() / ranges)
     names = dict.fromkeys(filters or (settings.filter_text,))
