@@ -29,10 +29,7 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
         f"NIS per degree of freedom {found['nis_per_dof']:.2f} (1: consistent), log-likelihood "
         f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % rejected"
     )
-    table = new_table("residuals after the update")
-    table.add_column("")
-    for heading in _HEADINGS:
-        table.add_column(heading, justify="right")
+    table = new_table("residuals after the update", [""], _HEADINGS)
     for kind in ("anchor", "tag"):
         rows = found["residuals"][f"{kind}s"]
         if len(rows) > _ROWS:
@@ -81,10 +78,9 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel("NIS / dof")
-    axes.set_xlabel("time [s]")
-    axes.legend(frameon=False, fontsize=7, loc="lower right")
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(xlabel="time [s]", ylabel="NIS / dof")
+    axes.legend(fontsize=7, loc="lower right")
+    axes.grid(True)
 
 
 def consistency_parts(replayed: Replayed) -> list[str]:
@@ -133,7 +129,6 @@ def consistency_parts(replayed: Replayed) -> list[str]:
 
 def _charts(replayed: Replayed) -> Any:
     """Return charts of NIS over time, mean residual and rejected fraction of every link."""
-    from plotly import graph_objects as go
     from plotly.subplots import make_subplots
 
     track, found = replayed.track, replayed.track.innovations
@@ -148,12 +143,10 @@ def _charts(replayed: Replayed) -> Any:
         subplot_titles=["NIS per degree of freedom", "mean residual (m)", "refused (%)"],
     )
     for values, fill in ((high, None), (low, "tonexty")):
-        band = {"color": _BAND, "width": 0}
-        shown.add_trace(
-            go.Scatter(x=when, y=values, mode="lines", line=band, fill=fill, hoverinfo="skip"), 1, 1
-        )
+        style: dict[str, Any] = {"mode": "lines", "line": {"color": _BAND, "width": 0}}
+        shown.add_scatter(x=when, y=values, fill=fill, hoverinfo="skip", row=1, col=1, **style)
     line = {"color": _HONEST, "width": 1.2}
-    shown.add_trace(go.Scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line), 1, 1)
+    shown.add_scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line, row=1, col=1)
     shown.update_yaxes(type="log", dtick=1, row=1, col=1)
     shown.update_xaxes(title_text="time (s)", title_standoff=4, row=1, col=1)
     rows = replayed.figures["consistency"]["residuals"]["links"]
@@ -170,20 +163,18 @@ def _charts(replayed: Replayed) -> Any:
         (3, refused, "Reds", (0.0, max(float(np.nanmax(refused, initial=0.0)), 1.0)),
          "xaxis3"),
     ):  # fmt: skip
-        shown.add_trace(
-            go.Heatmap(
-                z=values,
-                x=[f"tag {tag}" for tag in tags],
-                y=[f"anchor {anchor}" for anchor in anchors],
-                colorscale=scale,
-                reversescale=scale == "RdBu",
-                zmin=ends[0],
-                zmax=ends[1],
-                colorbar={"x": layout[axis].domain[1], "thickness": 10, "len": 0.9},
-                hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
-            ),
-            1,
-            column,
+        shown.add_heatmap(
+            z=values,
+            x=[f"tag {tag}" for tag in tags],
+            y=[f"anchor {anchor}" for anchor in anchors],
+            colorscale=scale,
+            reversescale=scale == "RdBu",
+            zmin=ends[0],
+            zmax=ends[1],
+            colorbar={"x": layout[axis].domain[1], "thickness": 10, "len": 0.9},
+            hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
+            row=1,
+            col=column,
         )
         shown.update_yaxes(autorange="reversed", row=1, col=column)
     shown.update_annotations(font_size=13)

@@ -32,13 +32,12 @@ def doa2019_figure(result: dict[str, Any]) -> Figure:
                 values = np.where(np.array(method["near"]) > 0, method[key], np.nan)
                 ax.loglog(sigma, values, "o-", ms=4, lw=1.3, color=_COLOURS[name], label=name)
             ax.loglog(sigma, data["bound"][key], "k+--", ms=8, lw=0.8, label="CCRB")
-            ax.set_ylabel(title)
-            ax.set_title(f"{paper}{label}: trials near the truth", fontsize=9)
-            ax.grid(alpha=0.25, lw=0.5)
+            ax.set(ylabel=title, title=f"{paper}{label}: trials near the truth")
+            ax.grid(True)
         _successes(axes[row, 2], label, data, result["table_1"])
     for ax in axes[-1]:
         ax.set_xlabel("standard deviation of the angles [deg]")
-    axes[0, 0].legend(frameon=False, fontsize=8)
+    axes[0, 0].legend()
     return figure
 
 
@@ -56,9 +55,9 @@ def _successes(ax: Any, label: str, data: dict[str, Any], table_1: dict[str, Any
     if label == _PAPERS:
         ax.plot([], [], "D", mfc="w", mec="k", ms=4, label="Table 1")
     ax.set_xticks(places, [f"{sigma:g}" for sigma in data["sigma_deg"]])
-    ax.set_title(f"{label}: successes", fontsize=9)
+    ax.set_title(f"{label}: successes")
     ax.set(ylabel="near the truth [%]", ylim=(0, 122), yticks=range(0, 101, 20))
-    ax.legend(frameon=False, fontsize=8, loc="upper right", ncols=2)
+    ax.legend(loc="upper right", ncols=2)
 
 
 def print_doa2019(result: dict[str, Any]) -> None:
@@ -66,22 +65,12 @@ def print_doa2019(result: dict[str, Any]) -> None:
     out = new_console()
     _print_table_1(out, result)
     for label, data in result["settings"].items():
-        table = new_table(f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
-        table.add_column("noise (deg)")
-        table.add_column("method")
-        for heading in (
-            "R RMSE",
-            "R / bound",
-            "t RMSE (m)",
-            "t / bound",
-            "near truth",
-            "t < 0.5 m",
-            "converged",
-            "iterations",
-            "us / trial",
-            "x NIA",
-        ):
-            table.add_column(heading, justify="right")
+        table = new_table(
+            f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials",
+            ["noise (deg)", "method"],
+            ["R RMSE", "R / bound", "t RMSE (m)", "t / bound", "near truth", "t < 0.5 m",
+             "converged", "iterations", "us / trial", "x NIA"],
+        )  # fmt: skip
         for k, sigma in enumerate(data["sigma_deg"]):
             for name, method in data["methods"].items():
                 row = {key: values[k] for key, values in method.items()}
@@ -120,19 +109,11 @@ def print_doa2019(result: dict[str, Any]) -> None:
 
 def _print_table_1(out: Any, result: dict[str, Any]) -> None:
     data = result["settings"][_PAPERS]
-    table = new_table(f"Table 1 of the paper beside ours, {_PAPERS}")
-    for heading in (
-        "noise (deg)",
-        "method",
-        "paper: success",
-        "ours: near truth",
-        "ours: t < 0.5 m",
-        "paper: time (s)",
-        "ours: time (s)",
-        "paper: x NIA",
-        "ours: x NIA",
-    ):
-        table.add_column(heading, justify="right")
+    headings = (
+        "noise (deg)", "method", "paper: success", "ours: near truth", "ours: t < 0.5 m",
+        "paper: time (s)", "ours: time (s)", "paper: x NIA", "ours: x NIA",
+    )  # fmt: skip
+    table = new_table(f"Table 1 of the paper beside ours, {_PAPERS}", (), headings)
     for k, sigma in enumerate(data["sigma_deg"]):
         for name, paper in result["table_1"].items():
             method = data["methods"][name]

@@ -37,11 +37,12 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                 color=_COLOURS[label],
             )
         axis.axhline(1.0, color="k", lw=0.8)
-        axis.set(yscale="log", title=name, ylabel="translation RMSE / clean bound")
+        axis.set(yscale="log", ylabel="translation RMSE / clean bound")
+        axis.set_title(name, fontsize="large")
         axis.set_xticks(
             range(len(conditions)), [label.replace(", ", ",\n") for label in conditions]
         )
-        axis.legend(frameon=False, loc="upper left")
+        axis.legend(fontsize="medium", loc="upper left")
     after = result["starts"]["after"]
     axes = lower.subplots(1, len(result["starts"]["scenes"]), squeeze=False)[0]
     for axis, (name, starts) in zip(axes, result["starts"]["scenes"].items(), strict=True):
@@ -56,9 +57,9 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                     ms=4,
                 )
         axis.set(xlabel="epochs later", ylabel="trials recovered [%]", ylim=(-3, 103))
-        axis.set_title(f"{name}: 180 degrees, 10 m off", fontsize=9)
+        axis.set_title(f"{name}: 180 degrees, 10 m off")
     handles = axes[-1].get_legend_handles_labels()
-    lower.legend(*handles, frameon=False, fontsize=9, loc="outside lower center", ncols=6)
+    lower.legend(*handles, fontsize=9, loc="outside lower center", ncols=6)
     return figure
 
 
@@ -66,21 +67,12 @@ def print_hard(result: dict[str, Any]) -> None:
     """Print one table of links for each scene, and one of starts."""
     console = new_console()
     for name, conditions in result["links"].items():
-        table = new_table(f"{name}, {result['trials']} trials")
-        table.add_column("links", no_wrap=True)
-        table.add_column("filter", no_wrap=True)
-        for heading in (
-            "rot / clean",
-            "pos / clean",
-            "rot / good",
-            "pos / good",
-            "NEES (6)",
-            "lost last",
-            "ever",
-            "largest (m)",
-            "us / step",
-        ):
-            table.add_column(heading, justify="right")
+        headings = (
+            "rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)", "lost last",
+            "ever", "largest (m)", "us / step",
+        )  # fmt: skip
+        title = f"{name}, {result['trials']} trials"
+        table = new_table(title, ["links", "filter"], headings, whole=2)
         for condition, row in conditions.items():
             for label, figures in row["filters"].items():
                 ratios = [
@@ -99,11 +91,8 @@ def print_hard(result: dict[str, Any]) -> None:
             table.add_section()
         console.print(table)
     after = result["starts"]["after"]
-    table = new_table(f"recovered trials (%) after so many epochs, {result['trials']} trials")
-    for heading in ("scene", "start", "filter"):
-        table.add_column(heading)
-    for heading in (*map(str, after), "us / step"):
-        table.add_column(heading, justify="right")
+    title = f"recovered trials (%) after so many epochs, {result['trials']} trials"
+    table = new_table(title, ["scene", "start", "filter"], [*map(str, after), "us / step"])
     for name, starts in result["starts"]["scenes"].items():
         for start, rows in starts.items():
             for label, row in rows.items():
