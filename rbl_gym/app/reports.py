@@ -266,10 +266,10 @@ def print_transfer(result: dict[str, Any]) -> None:
     """Print a table per filter: score and actual error, and their correlation."""
     console = new_console()
     for name, rows in result["filters"].items():
+        each = f", {result['repeats']} bodies in each" if "repeats" in result else ""
         table = new_table(
-            f"{result['task']}, {name}, {result['worlds']} worlds, "
-            f"{result['repeats']} bodies in each",
-            ["layouts"],
+            f"{result['task']}, {name}, {result['worlds']} worlds{each}",
+            ["layouts" if each else "policy"],
             ["score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"],
         )
         for label, row in rows.items():
