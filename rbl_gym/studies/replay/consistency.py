@@ -15,14 +15,15 @@ from rbl_gym.recordings.recording import Recording
 __all__ = ["contradicts", "nis_curve", "residual_tables"]
 
 # The data contradict a filter if the normalised innovations squared of a log, or of a tenth of it,
-# exceed this multiple of their expectation, or this share of ranges is rejected ...
+# exceed this multiple of their expectation, or if this share of the ranges is rejected,
 MOST_NIS, MOST_REFUSED, _PART = 1.5, 0.2, 0.1
-# ... and this is not random.
+# and if the probability of this by chance is below this value.
 _CHANCE = 1e-6
 _BLOCKS = 20
-# Also if the mean squared whitened innovation of an anchor or tag, clipped at that of a rejected
-# one, exceeds this value and this multiple of that of the others; or if more than half of those of
-# a link (with this number of ranges at least) exceed two standard deviations.
+# They also do if the mean squared whitened innovation of an anchor or tag exceeds the first value,
+# and the second multiple of the median over all of them; rejected innovations are clipped. Or if
+# more than half of the innovations of a link exceed the third value, in standard deviations. Both
+# need the fourth number of ranges.
 _MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
 
 
@@ -69,7 +70,7 @@ def contradicts(found: Innovations, recording: Recording) -> bool:
 
 
 def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatArray, ...]:
-    """Return NIS, used and rejected ranges of this number of parts of a log."""
+    """Return NIS, used and rejected ranges for this number of parts of a log."""
     links = recording.links.sum(axis=(1, 2))
     starts = np.unique(np.linspace(0, len(links), blocks, endpoint=False).astype(int))
     nis, dof, links = (np.add.reduceat(a, starts) for a in (found.nis, found.dof, links))
@@ -79,16 +80,17 @@ def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatA
 def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> BoolArray:
     by_chance = special.chdtri(np.maximum(dof, 1), _CHANCE)
     lost = refused > MOST_REFUSED * (dof + refused)
-    # A single wrong range in five is not reported.
+    # A single wrong range among five is not reported.
     return (nis > np.maximum(MOST_NIS * dof, by_chance)) | (lost & (refused > _BLOCKS))
 
 
 def residual_tables(found: Innovations, recording: Recording) -> dict[str, list[dict[str, Any]]]:
     """Return tables of residuals after the update, by anchor, by tag and by link.
 
-    A row has the ids, ``ranges`` (how many), ``mean_m`` of those used, ``spread_m`` of all (1.4826
-    times the median distance from the median: the standard deviation of a Gaussian), and
-    ``refused_share``. Points and links without ranges have no row.
+    A row has the ids, ``ranges`` (their number), ``mean_m`` over the used ranges, ``spread_m`` over
+    all ranges, and ``refused_share``. The spread is 1.4826 times the median distance from the
+    median, which is the standard deviation of a Gaussian. Points and links without ranges have no
+    row.
     """
     links = recording.links
     M, N = links.shape[1:]
