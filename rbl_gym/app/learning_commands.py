@@ -67,7 +67,7 @@ def add_transfer(commands: Any) -> None:
         "transfer",
         help="check policies by tracking bodies with filters",
         description="Track moving bodies with several filters, among anchors placed, moved or "
-        "selected by policies and references. This checks whether a good score means a small error.",
+        "selected by policies and references. This checks that a good score means a small error.",
     )
     defaults = "random, ring, greedy-swaps, hybrid; or random, orbit; or random, nearest, greedy"
     _add_players(transfer, list(TASKS), worlds=48, references=defaults)
