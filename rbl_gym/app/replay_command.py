@@ -117,7 +117,7 @@ def _add_filter(group: Any) -> None:
 
 def _add_motion(group: Any) -> None:
     _add_numbers(group, (
-        ("walk-m", "random walk of the position: standard deviation after 1 s, metres, default 0.1"),
+        ("walk-m", "random walk of the position: deviation after 1 s, metres, default 0.1"),
         ("walk-deg", "random walk of the rotation: standard deviation after 1 s, degrees, default "
          "7"),
         ("accel-m", "iekf-log, iekf-cv: standard deviation of the change of speed after 1 s, m/s; "
@@ -187,7 +187,7 @@ def _add_smoothing(group: Any) -> None:
 def _add_comparison(group: Any) -> None:
     _add_numbers(group, (
         ("yaw-offset-deg", "yaw error = estimate - (truth + offset)"),
-        ("truth-gap-s", "longest gap of truth or ranges that is interpolated, seconds, default 0.5"),
+        ("truth-gap-s", "longest interpolated gap of truth or ranges, seconds, default 0.5"),
     ))  # fmt: skip
     group.add_argument(
         "--truth-exclude",
