@@ -187,7 +187,7 @@ def _add_smoothing(group: Any) -> None:
 def _add_comparison(group: Any) -> None:
     _add_numbers(group, (
         ("yaw-offset-deg", "yaw error = estimate - (truth + offset)"),
-        ("truth-gap-s", "longest gap of truth or ranges to interpolate, seconds, default 0.5"),
+        ("truth-gap-s", "longest interpolated gap of truth or ranges, seconds, default 0.5"),
     ))  # fmt: skip
     group.add_argument(
         "--truth-exclude",
