@@ -137,8 +137,8 @@ def test_walk(batch):
     start = rotations.random(rng, batch), rng.normal(size=(*batch, 3))
     twists, normals = rng.standard_normal((2, *batch, 7, 6))
     std = np.array([0.1, 0.0, 0.2, 1, 2, 3])
-    assert_equal_forms(kinematics._walk, *start, twists, normals, std, 0.1)
-    assert_equal_forms(kinematics._walk, *start, np.zeros((7, 6)), normals, std, 0.1)
+    assert_equal_forms(kinematics._walk, *start, twists, normals, std, 0.1, np.empty(8))
+    assert_equal_forms(kinematics._walk, *start, np.zeros((7, 6)), normals, std, 0.1, np.empty(8))
 
 
 @every_batch
@@ -484,6 +484,8 @@ def test_places_on_walls(batch):
     actions = actions.reshape(-1, *(1 for _ in batch), 3) * np.ones((*batch, 1))
     assert_equal_forms(regions.place_on_walls, actions, low, high)
     assert_equal_forms(regions._project_on_walls, 0.7 + 3.1 * actions, low, high)
+    assert_equal_forms(regions._project_to_box, 0.7 + 3.1 * actions, low, high)
+    assert_equal_forms(regions._place_in_box, actions, low, high)
 
 
 @every_batch

@@ -193,8 +193,7 @@ class Box(Faced):
 
     def project(self, points: FloatArray) -> FloatArray:
         """Return points with every coordinate clipped."""
-        low, high = self._corners
-        return np.minimum(np.maximum(points, low), high)
+        return _project_to_box(points, *self._corners)
 
     @functools.cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:
@@ -202,8 +201,7 @@ class Box(Faced):
 
     def place(self, action: FloatArray) -> FloatArray:
         """Return points of actions; [-1, 1]^3 maps to the box."""
-        middle, half = self._middle
-        return middle + _cut(action) * half
+        return _place_in_box(action, *self._middle)
 
     @functools.cached_property
     def _middle(self) -> tuple[FloatArray, FloatArray]:
@@ -288,11 +286,23 @@ def _faces(low: FloatArray, high: FloatArray) -> tuple[np.ndarray, FloatArray]:
     return np.array([0, 0, 1, 1, 2]), np.stack(values, axis=-1)
 
 
+@compiled("walls:project_to_box")
+def _project_to_box(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Compute `Box.project` in boxes between two corners (..., 3)."""
+    return np.minimum(np.maximum(points, low), high)
+
+
+@compiled("walls:place_in_box")
+def _place_in_box(action: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
+    """Compute `Box.place` in boxes of this centre and half size (..., 3)."""
+    return middle + _cut(action) * half
+
+
 @compiled("walls:project")
 def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Compute `Walls.project` in rooms between two corners (..., 3)."""
     axes, values = _faces(low, high)
-    inside = np.minimum(np.maximum(points, low), high)
+    inside = _project_to_box.textbook(points, low, high)
     outside = (points - inside) ** 2
     # Squared distance to each surface. Below the floor, the smallest gap alone is misleading.
     squares = outside.sum(axis=-1)[..., None] - outside[..., axes]

@@ -16,15 +16,22 @@ from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.noise_laws import reference_of, sample
 
 
-@gufunc("(d,d),(d),(t,s),(t,s),(s),()->(t,d,d),(t,d)")
+@gufunc("(d,d),(d),(t,s),(t,s),(s),(),(e)->(e,d,d),(e,d)")
 def walk(
-    rotation: Any, translation: Any, twists: Any, normals: Any, std: Any, dt: float,
-    rotations_after: Any, translations_after: Any,
+    rotation: Any, translation: Any, twists: Any, normals: Any, std: Any, dt: float, like: Any,
+    rotations_of: Any, translations_of: Any,
 ) -> None:  # fmt: skip
-    """Return poses after each of T steps of nominal twists with noise, std (6,) after 1 s."""
+    """Return the start and the poses after each of T steps of twists with noise.
+
+    std (6,) is that of the noise after 1 s. `like` (T + 1,) only defines the shapes of the results.
+    """
     turn = np.empty((3, 3))
     root = math.sqrt(dt)
     x = y = z = 0.0
+    for i in range(3):
+        translations_of[0, i] = translation[i]
+        for j in range(3):
+            rotations_of[0, i, j] = rotation[i, j]
     for k in range(twists.shape[0]):
         rotations.exp(
             (normals[k, 0] * (std[0] / root) + twists[k, 0]) * dt,
@@ -32,20 +39,13 @@ def walk(
             (normals[k, 2] * (std[2] / root) + twists[k, 2]) * dt,
             turn,
         )
-        before = rotation if k == 0 else rotations_after[k - 1]
-        for i in range(3):
-            for j in range(3):
-                rotations_after[k, i, j] = (
-                    turn[i, 0] * before[0, j]
-                    + turn[i, 1] * before[1, j]
-                    + turn[i, 2] * before[2, j]
-                )
+        rotations.compose(turn, rotations_of[k], rotations_of[k + 1])
         x += (normals[k, 3] * (std[3] / root) + twists[k, 3]) * dt
         y += (normals[k, 4] * (std[4] / root) + twists[k, 4]) * dt
         z += (normals[k, 5] * (std[5] / root) + twists[k, 5]) * dt
-        translations_after[k, 0] = translation[0] + x
-        translations_after[k, 1] = translation[1] + y
-        translations_after[k, 2] = translation[2] + z
+        translations_of[k + 1, 0] = translation[0] + x
+        translations_of[k + 1, 1] = translation[1] + y
+        translations_of[k + 1, 2] = translation[2] + z
 
 
 @gufunc("(k,d),(t)->(t,d)")

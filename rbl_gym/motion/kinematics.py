@@ -153,15 +153,12 @@ def simulate(
         Standard normals (..., T, 6); None: no process noise.
     """
     dt = check_number("dt", dt, low=1e-12)
-    start, twists = trajectory.rotation, trajectory.twists
+    twists = trajectory.twists
     if normals is None:
         normals = np.zeros_like(twists)
-    turned, moved = _walk(start, trajectory.translation, twists, normals, process.std(), dt)
-    rotation = np.empty((*moved.shape[:-2], moved.shape[-2] + 1, 3, 3))
-    rotation[..., 0, :, :], rotation[..., 1:, :, :] = start, turned
-    translation = np.empty((*moved.shape[:-2], moved.shape[-2] + 1, 3))
-    translation[..., 0, :], translation[..., 1:, :] = trajectory.translation, moved
-    return Path(rotation, translation)
+    epochs = np.empty(twists.shape[-2] + 1)
+    start = trajectory.rotation, trajectory.translation
+    return Path(*_walk(*start, twists, normals, process.std(), dt, epochs))
 
 
 @compiled("epoch:walk")
@@ -172,20 +169,25 @@ def _walk(
     normals: FloatArray,
     std: FloatArray,
     dt: ArrayLike,
+    like: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return poses (..., T, 3, 3), (..., T, 3) after each step; `std` (..., 6) after 1 s."""
+    """Return poses (..., T + 1, 3, 3), (..., T + 1, 3): the start, and those after each step.
+
+    `std` (..., 6) is that of the noise after 1 s. `like` (T + 1,) only gives a kernel the size of
+    the results.
+    """
     dt = np.asarray(dt, dtype=np.float64)[..., None, None]
     steps = dt * (twists + normals * (std[..., None, :] / np.sqrt(dt)))
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1], steps.shape[:-2])
-    rotations_after = np.empty((*batch, steps.shape[-2], 3, 3))
+    rotations_of = np.empty((*batch, *like.shape, 3, 3))
+    translations_of = np.empty((*batch, *like.shape, 3))
+    rotations_of[..., 0, :, :], translations_of[..., 0, :] = rotation, translation
     turns = _EXP(steps[..., :3])
     for k in range(steps.shape[-2]):
-        rotation = turns[..., k, :, :] @ rotation
-        rotations_after[..., k, :, :] = rotation
+        rotations_of[..., k + 1, :, :] = turns[..., k, :, :] @ rotations_of[..., k, :, :]
     moves = np.cumsum(steps[..., 3:], axis=-2)
-    return rotations_after, np.broadcast_to(
-        translation[..., None, :] + moves, (*batch, *moves.shape[-2:])
-    )
+    translations_of[..., 1:, :] = translation[..., None, :] + moves
+    return rotations_of, translations_of
 
 
 def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike) -> FloatArray:
