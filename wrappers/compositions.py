@@ -8,6 +8,7 @@ environment.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -144,8 +145,13 @@ class Task(StatedLength):
     @property
     def world(self) -> Any:
         """The scene of this episode; of a family in the vector form, the stacked scenes."""
-        env = self.inner.unwrapped
+        env = self._base
         return getattr(env, "world", env.scene)
+
+    @functools.cached_property
+    def _base(self) -> Any:
+        """The environment below all wrappers of the stack."""
+        return self.inner.unwrapped
 
     def _price(self, info: dict[str, Any]) -> Any:
         """Return the cost of the step with these infos."""

@@ -105,6 +105,11 @@ class IteratedEkf:
         return tuple(map(np.asarray, codes))
 
     @functools.cached_property
+    def _numbers(self) -> FloatArray | None:
+        """Return the noise law as used by `update_pose`; None if it does not support it."""
+        return numbers_of(self.noise, len(self.tags))
+
+    @functools.cached_property
     def _variance(self) -> FloatArray:
         """Return the variances (..., 6) of the process noise after 1 s."""
         return self.process.std() ** 2
@@ -217,7 +222,7 @@ class IteratedEkf:
     ) -> tuple[FloatArray | None, FloatArray | None]:
         """Return shares and law for `update_pose`; None if the general code must compute them."""
         if links is None and noise is None:
-            return all_links(*ranges.shape[-2:]), numbers_of(self.noise, len(self.tags))
+            return all_links(*ranges.shape[-2:]), self._numbers
         if type(links) is not np.ndarray or links.dtype != _BOOL or links.shape != ranges.shape:
             return None, None
         if type(noise) is LinkNoise and noise.std_m.shape == ranges.shape and noise.std_m.min() > 0:
