@@ -404,10 +404,64 @@ def test_errors_are_one_line(tmp_path, capsys):
         error = capsys.readouterr().err.strip().splitlines()[-1]
         assert error.startswith("rbl-gym ")
         assert message in error
-    for arguments in (["evaluate", "selection", "--worlds", "0"], ["train", "chess"],
-                      ["transfer", "selection"]):  # fmt: skip
+    for arguments in (["evaluate", "selection", "--worlds", "0"], ["train", "chess"]):
         with pytest.raises(SystemExit):
             main(arguments)
+
+
+def test_transfer_of_a_loop_by_hand():
+    """Scores and errors after ten steps, of a policy in drawn worlds, filter by filter."""
+    scenes = [{"name": "auv_craft", "n_anchors": {"integers": [2, 3]}, "steps": 14}]
+    task = rl_task("mobile-easy").in_worlds(scenes=scenes)
+    size = task.make(1).single_observation_space.shape[0]
+    policy = random_policy("box", (size, 4, 6), seed=2)
+    told: list[int] = []
+    found = transfer.transfer_task(
+        task, {"mine": policy}, ["orbit"], 4, 1, 5, lambda n=1, more=0: told.append(n)
+    )
+    assert list(found["filters"]) == ["iekf", "iekf-bank", "iekf, reflections"]
+    assert sum(told) == 6
+    law = {"nlos_probability": transfer.NLOS_PROBABILITY, "nlos_bias_m": transfer.NLOS_BIAS_M}
+    for name in ("iekf", "iekf, reflections"):
+        kind, options, reflections = transfer.FILTERS[name]
+        members = [{**scenes[0], "links": law}] if reflections else scenes
+        filter = {"name": kind, **options}
+        scores, errors = [], []
+        for i in range(4):
+            env = gym.make("rbl_gym:RBL/MobileAnchors-v0", scenes=members, filter=filter,
+                           difficulty="easy")  # fmt: skip
+            seen, _ = env.reset(seed=HELD_OUT_SEED + 5 * SEED_STRIDE + i)
+            infos, over = [], False
+            while not over:
+                seen, _, _, over, info = env.step(policy(seen).astype(np.float32))
+                infos.append(info)
+            last = infos[10:]
+            assert len(last) == 4
+            scores.append(np.mean([np.log(info["score_m"]) for info in last]))
+            errors.append(0.5 * np.log(np.mean([info["tag_error_m"] ** 2 for info in last])))
+        row = found["filters"][name]["mine"]
+        assert row["score_m"] == pytest.approx(np.exp(np.mean(scores)), rel=1e-4)
+        assert row["tag_rmse_m"] == pytest.approx(np.exp(np.mean(errors)), rel=1e-4)
+        assert row["correlation"] == pytest.approx(np.corrcoef(scores, errors)[0, 1], abs=1e-3)
+    rows = found["filters"]["iekf"]
+    assert rows["orbit"]["tag_rmse_m"] < rows["mine"]["tag_rmse_m"]
+
+
+def test_transfer_of_a_loop_in_its_own_scene_and_a_short_one(tmp_path, capsys):
+    path = tmp_path / "mine.npz"
+    policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
+    scene = tmp_path / "hall.json"
+    scene.write_text('{"name": "hall", "steps": 12}')
+    arguments = ["transfer", "selection", "--scene", str(scene), "--worlds", "3"]
+    arguments += ["--policy", str(path), "--references", "random,greedy-blind"]
+    assert main(arguments) == 0
+    table = capsys.readouterr().out
+    assert "greedy-blind" in table
+    assert "reflections" in table
+    assert "mine" in table
+    scene.write_text('{"name": "hall", "steps": 10}')
+    assert main(arguments) == 2
+    assert "scenes must have episodes of more than 10 steps" in capsys.readouterr().err
 
 
 # --- scenes that are drawn --------------------------------------------------------------------

@@ -65,14 +65,18 @@ def add_transfer(commands: Any) -> None:
     """Add the parser of ``rbl-gym transfer``."""
     transfer = commands.add_parser(
         "transfer",
-        help="check layouts of policies by tracking bodies with filters",
-        description="Track moving bodies among anchors placed by policies and references. This "
-        "checks whether layouts with a good bound also track well.",
+        help="check layouts and policies by tracking bodies with filters",
+        description="Track moving bodies with several filters, among anchors placed, moved or "
+        "selected by policies and references. This checks whether a good score means a small "
+        "error.",
     )
-    placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
-    _add_players(transfer, placements, worlds=48, references="random, ring, greedy-swaps, hybrid")
+    defaults = "random, ring, greedy-swaps, hybrid; or random, orbit; or random, nearest, greedy"
+    _add_players(transfer, list(TASKS), worlds=48, references=defaults)
     transfer.add_argument(
-        "--repeats", type=positive, default=16, help="bodies in each world, default 16"
+        "--repeats",
+        type=positive,
+        default=16,
+        help="bodies in each world of a placement task, default 16",
     )
     add_json(transfer)
     transfer.set_defaults(run=_transfer)
@@ -191,7 +195,7 @@ def _transfer(options: argparse.Namespace) -> int:
     names = _references(options, task, transfer.transfer_references(task))
     try:
         with progress(_title(options)) as advance:
-            result = transfer.transfer_layouts(
+            result = transfer.transfer_task(
                 task, loaded, names, options.worlds, options.repeats, options.seed, advance
             )
     except ModuleNotFoundError as error:

@@ -275,11 +275,9 @@ def print_transfer(result: dict[str, Any]) -> None:
     """Print a table per filter: score and actual error, and their correlation."""
     console = new_console()
     for name, rows in result["filters"].items():
-        table = new_table(
-            f"{result['task']}, {name}, {result['worlds']} worlds, "
-            f"{result['repeats']} bodies in each"
-        )
-        table.add_column("layouts")
+        each = f", {result['repeats']} bodies in each" if "repeats" in result else ""
+        table = new_table(f"{result['task']}, {name}, {result['worlds']} worlds{each}")
+        table.add_column("layouts" if each else "policy")
         for heading in ("score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"):
             table.add_column(heading, justify="right")
         for label, row in rows.items():

@@ -53,7 +53,7 @@ def references(task: RlTask) -> list[str]:
         # There is no single layout for different rooms.
         one = [] if "scenes" in task.arguments else [_ONE_LAYOUT]
         return [*layouts.LAYOUTS, *one, *others, *last]
-    return list(_controllers(task))
+    return list(controllers_of(task))
 
 
 def strongest(task: RlTask) -> list[str]:
@@ -62,7 +62,8 @@ def strongest(task: RlTask) -> list[str]:
     return known[-len(search.STRONGEST) :] if known[-1] in search.STRONGEST else known[-1:]
 
 
-def _controllers(task: RlTask) -> dict[str, controllers.Controller]:
+def controllers_of(task: RlTask) -> dict[str, controllers.Controller]:
+    """Return the references of a task with a filter in the loop."""
     mobile = task.env_id == "RBL/MobileAnchors-v0"
     return controllers.MOBILE if mobile else controllers.SELECTION
 
@@ -212,7 +213,7 @@ def _loop_losses(
     advance: Advance,
 ) -> dict[str, FloatArray]:
     def reference(name: str, rng: np.random.Generator) -> FloatArray:
-        controller = _controllers(task)[name]
+        controller = controllers_of(task)[name]
         return _rollout(task, lambda env, _: controller(env, rng), worlds, seed)
 
     def policy(played: AnyPolicy) -> FloatArray:

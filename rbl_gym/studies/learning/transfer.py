@@ -1,13 +1,17 @@
-"""Tracking errors of layouts, measured with real filters, in comparison to the bound.
+"""Tracking errors of layouts and policies, measured with real filters, in comparison to the score.
 
-Bodies move through way-points in each work region, among the anchors of a method. A filter tracks
-them from the scene's prior, and knows which links lack sight. The comparison is between the score
-b, which the layouts minimise, and the filter's root mean square tag error.
+Layouts: bodies move through way-points in each work region, among the anchors of a method. A filter
+tracks them from the scene's prior, and knows which links lack sight. The comparison is between the
+score b, which the layouts minimise, and the filter's root mean square tag error.
+
+Tasks with a filter in the loop: episodes with other filters than that of the training.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +24,9 @@ from rbl_gym.measurements import ranging
 from rbl_gym.placement import search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.epochs import Reading, track_epochs
-from rbl_gym.studies.learning import evaluation
+from rbl_gym.studies.learning import evaluation, rollouts
 from rbl_gym.studies.learning.evaluation import Layouts
-from rbl_gym.studies.learning.policies import AnyPolicy
+from rbl_gym.studies.learning.policies import AnyPolicy, check_fit
 from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds.scene import Scene
@@ -32,7 +36,9 @@ __all__ = [
     "track_layouts",
     "tracking_filters",
     "transfer_layouts",
+    "transfer_loops",
     "transfer_references",
+    "transfer_task",
 ]
 
 # Steps of an episode, settling steps at its start, and way-points of an episode.
@@ -47,19 +53,139 @@ FILTERS = {
 }
 
 
+# Scenes of the tasks with a filter in the loop, where the arguments have none.
+_OWN_SCENES = {"RBL/MobileAnchors-v0": "auv_craft", "RBL/AnchorSelection-v0": "hall"}
+
+
 def transfer_references(task: RlTask) -> list[str]:
-    """References for layouts besides policies, as far as the task has them."""
+    """Return default references besides the policies, as far as the task has them."""
+    wanted = ("random", "ring", "greedy-swaps", "hybrid")
+    if task.env_id in _OWN_SCENES:
+        wanted = ("random", "orbit", "nearest", "greedy-blind", "greedy-with-map")
     known = evaluation.references(task)
-    return [name for name in ("random", "ring", "greedy-swaps", "hybrid") if name in known]
+    return [name for name in wanted if name in known]
 
 
 def tracking_filters(task: RlTask) -> list[str]:
-    """Return filters for the task's scene. UC-KF needs anchors that are not coplanar."""
+    """Return filters for the task's scene. UC-KF needs placed anchors that are not coplanar."""
+    if task.env_id in _OWN_SCENES:
+        return [name for name in FILTERS if name != "uc-kf"]
     env = task.make(1)
     known = env.family.corners if "scenes" in task.arguments else (env.task,)
     corners = [one.scene.anchor_region.bounds() for one in known]
     solid = all((high > low).all() for low, high in corners)
     return [name for name in FILTERS if name != "uc-kf" or solid]
+
+
+def transfer_task(
+    task: RlTask,
+    policies: dict[str, AnyPolicy],
+    names: list[str],
+    worlds: int,
+    repeats: int,
+    seed: int,
+    advance: Advance = silent,
+) -> dict[str, Any]:
+    """Return `transfer_loops` of a task with a filter in the loop, otherwise `transfer_layouts`.
+
+    Only layouts have `repeats`.
+    """
+    if task.env_id in _OWN_SCENES:
+        return transfer_loops(task, policies, names, worlds, seed, advance)
+    return transfer_layouts(task, policies, names, worlds, repeats, seed, advance)
+
+
+def transfer_loops(
+    task: RlTask,
+    policies: dict[str, AnyPolicy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Advance = silent,
+) -> dict[str, Any]:
+    """Run policies and references in held-out worlds with each filter in the loop.
+
+    Policies and references act on the belief of that filter.
+
+    Parameters
+    ----------
+    task
+        A task with a filter in the loop.
+    policies
+        Policies by label.
+    names
+        Names of `evaluation.references`.
+    worlds, seed
+        Held-out worlds.
+    advance
+        Called after every filter and label.
+
+    Returns
+    -------
+    As `track_layouts`, with `worlds` and `seed`. Score and error are those of the steps after the
+    first ten; the correlation is over the worlds.
+    """
+    for label, policy in policies.items():
+        check_fit(policy, label, task.make(1))
+    table = evaluation.controllers_of(task)
+    filters = tracking_filters(task)
+    advance(0, more=len(filters) * (len(names) + len(policies)))
+    found: dict[str, Any] = {}
+    for name in filters:
+        under = _with_filter(task, name)
+        rows = found[name] = {}
+        for label in [*names, *policies]:
+            if label in policies:
+                act: Any = policies[label].player()
+            else:
+                rng = np.random.default_rng([seed, evaluation.references(task).index(label)])
+                act = functools.partial(_controlled, table[label], rng)
+            score, error = _episode_logs(under, act, worlds, seed)
+            rows[label] = {
+                "score_m": float(np.exp(score.mean())),
+                "tag_rmse_m": float(np.exp(error.mean())),
+                "correlation": _correlation(score, error),
+            }
+            advance()
+    return {"filters": found, "worlds": worlds, "seed": seed}
+
+
+def _controlled(controller: Any, rng: np.random.Generator, env: Any, _: Any) -> FloatArray:
+    return controller(env, rng)
+
+
+def _with_filter(task: RlTask, name: str) -> RlTask:
+    """Return the task with a filter of `FILTERS` in the loop, and its reflections in the scenes."""
+    kind, options, reflections = FILTERS[name]
+    arguments = {**task.arguments, "filter": {"name": kind, **options}}
+    if reflections:
+        key = "scenes" if "scenes" in arguments else "scene"
+        scenes = arguments.get(key, _OWN_SCENES[task.env_id])
+        one = isinstance(scenes, str | Mapping | Scene)
+        made = [_reflecting(scene) for scene in ([scenes] if one else scenes)]
+        arguments[key] = made[0] if one else made
+    return dataclasses.replace(task, arguments=arguments)
+
+
+def _reflecting(scene: Any) -> Any:
+    law = {"nlos_probability": NLOS_PROBABILITY, "nlos_bias_m": NLOS_BIAS_M}
+    if isinstance(scene, Scene):
+        return dataclasses.replace(scene, links=dataclasses.replace(scene.links, **law))
+    scene = {"name": scene} if isinstance(scene, str) else dict(scene)
+    return {**scene, "links": {**scene.get("links", {}), **law}}
+
+
+def _episode_logs(task: RlTask, act: Any, worlds: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Return mean logs of the score and logs of the root mean square tag error (worlds,)."""
+    score, square, count = np.zeros(worlds), np.zeros(worlds), np.zeros(worlds)
+    for k, (going, _, _, info) in enumerate(rollouts.steps(task, act, worlds, seed), start=1):
+        if k > _SETTLING:
+            score += np.where(going, np.log(info["score_m"]), 0.0)
+            square += np.where(going, info["tag_error_m"] ** 2, 0.0)
+            count += going
+    if not count.all():
+        raise ValueError(f"scenes must have episodes of more than {_SETTLING} steps")
+    return score / count, 0.5 * np.log(square / count)
 
 
 class Bodies(NamedTuple):
