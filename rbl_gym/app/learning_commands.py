@@ -65,9 +65,10 @@ def add_transfer(commands: Any) -> None:
     """Add the parser of ``rbl-gym transfer``."""
     transfer = commands.add_parser(
         "transfer",
-        help="check policies by tracking bodies with filters",
+        help="check layouts and policies by tracking bodies with filters",
         description="Track moving bodies with several filters, among anchors placed, moved or "
-        "selected by policies and references. This checks that a good score means a small error.",
+        "selected by policies and references. This checks whether a good score means a small "
+        "error.",
     )
     defaults = "random, ring, greedy-swaps, hybrid; or random, orbit; or random, nearest, greedy"
     _add_players(transfer, list(TASKS), worlds=48, references=defaults)

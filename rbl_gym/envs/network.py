@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -10,8 +12,17 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, check_count, check_one_of
 from rbl_gym.envs.batch import BatchEnv
+from rbl_gym.envs.network_plans import (
+    COLUMNS,
+    PRIOR_STD_RAD,
+    NetworkFamily,
+    NetworkPlan,
+    network_family,
+    numbers_of,
+    sensing_of,
+)
 from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.networks.bounds import Sensing, linked_covariance, linked_pose_covariance
 from rbl_gym.networks.graphs import components
@@ -20,26 +31,11 @@ from rbl_gym.rendering import network as rendering
 
 REWARDS = ("bound", "none")
 LENGTHS = ("none", "one", "all")
-# Standard deviation of an unknown orientation, uniform on the circle.
-PRIOR_STD_RAD = math.pi / math.sqrt(3)
 # Standard deviation of the known length, as a fraction of the square's side: small enough to be
 # practically exact, and large enough for iterations to converge.
 _KNOWN = 1e-4
-# Bounds below a millionth of a radian and of the side are not reliable in double precision.
-_SHARPEST = 1e-6
-# Limit of the observation space: the longest link plus this many standard deviations.
-_TAIL = 8.0
 # Number of layouts tried to find one that is connected at the start.
 _TRIES = 64
-# Limit of n: the bound inverts n x n matrices.
-MOST_NODES = 10_000
-
-
-def _ring(low: float, high: float) -> tuple[float, float]:
-    """Return mean and standard deviation of the distance of points spread evenly over a ring."""
-    high = max(high, 1.001 * low)
-    mean = 2 / 3 * (high**3 - low**3) / (high**2 - low**2)
-    return mean, math.sqrt((high**2 + low**2) / 2 - mean**2)
 
 
 class PlanarNetworkVectorEnv(BatchEnv):
@@ -67,96 +63,136 @@ class PlanarNetworkVectorEnv(BatchEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        scenes: Any = None,
     ) -> None:
         steps = check_count("steps", steps)
-        self.n_nodes = n_nodes = check_count("n_nodes", n_nodes, least=2, most=MOST_NODES)
-        self.side_m = check_number("side_m", side_m, low=1e-6)
-        self.radius_m = check_number("radius_m", radius_m, low=0.0)
-        self.blind_m = check_number("blind_m", blind_m, low=1e-9)
-        self.bearing_std_rad = check_number("bearing_std_rad", bearing_std_rad, low=1e-9)
         self.lengths = check_one_of("lengths", lengths, LENGTHS)
-        self.length_std_m = check_number("length_std_m", length_std_m, low=1e-9)
-        if lengths == "one":
-            self.length_std_m = _KNOWN * self.side_m
-        reach = min(self.radius_m, self.side_m * math.sqrt(2))
-        self.sensing = Sensing(
-            bearing_std_rad=max(self.bearing_std_rad, _SHARPEST),
-            length_std_m=max(self.length_std_m, _SHARPEST * self.side_m),
-            typical_length_m=_ring(self.blind_m, reach),
-            prior_std_rad=PRIOR_STD_RAD,
-            prior_std_m=self.side_m / math.sqrt(6),
+        plan = NetworkPlan(
+            n_nodes, side_m, radius_m, blind_m, bearing_std_rad, length_std_m, step_m
         )
-        self.step_m = check_number("step_m", step_m, low=0.0)
+        self.family = None if scenes is None else network_family(scenes, plan)
+        # Largest values of all networks.
+        most = self._plan = self._known(plan if self.family is None else self.family.highest)
+        self.n_nodes = most.n_nodes
         self._rewarded = check_one_of("reward", reward, REWARDS) == "bound"
-        square = (n_nodes, n_nodes)
+        square = (self.n_nodes, self.n_nodes)
         observed: dict[str, spaces.Space[Any]] = {
             "bearings": spaces.Box(-math.pi, math.pi, square, np.float64),
             "links": spaces.Box(0, 1, square, np.int8),
         }
-        self._longest = reach + _TAIL * self.length_std_m
         if lengths != "none":
-            observed["lengths"] = spaces.Box(0.0, self._longest, square, np.float64)
+            observed["lengths"] = spaces.Box(0.0, most.longest_m, square, np.float64)
+        if self.family is not None:
+            observed["node_mask"] = spaces.MultiBinary(self.n_nodes)
+            observed["network"] = spaces.Box(0.0, np.array(numbers_of(most)), dtype=np.float64)
         self.single_observation_space = spaces.Dict(observed)
-        self.single_action_space = spaces.Box(-1.0, 1.0, (2 * n_nodes,), np.float32)
-        self.film = rendering.film_of(render_mode, self.side_m, n_nodes, steps)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (2 * self.n_nodes,), np.float32)
+        self.film = rendering.film_of(render_mode, most.side_m, self.n_nodes, steps)
         self._configure(num_envs, render_mode, steps, max_episode_steps, autoreset_mode)
-        self._positions = np.zeros((num_envs, n_nodes, 2))
-        self._orientations = np.zeros((num_envs, n_nodes))
+        self._plans = [most] * num_envs
+        self._there = np.ones((num_envs, self.n_nodes), dtype=np.bool_)
+        # Numbers of the networks, in the order of `NetworkPlan` without the number of nodes.
+        self._numbers = np.tile(numbers_of(most), (num_envs, 1))
+        self._positions = np.zeros((num_envs, self.n_nodes, 2))
+        self._orientations = np.zeros((num_envs, self.n_nodes))
         self._links = np.zeros((num_envs, *square), dtype=np.bool_)
         self._bearings = np.zeros((num_envs, *square))
         self._lengths = np.zeros((num_envs, *square))
-        self._std = np.zeros((num_envs, n_nodes))
+        self._std = np.zeros((num_envs, self.n_nodes))
         self._score_rad = np.zeros(num_envs)
         self._score_m = np.zeros(num_envs)
 
-    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        for world, generator in zip(chosen, generators, strict=True):
-            self._positions[world] = self._layout(generator)
-            theta = generator.uniform(-np.pi, np.pi, self.n_nodes)
-            self._orientations[world] = proj(theta - theta[0])
+    @property
+    def sensing(self) -> Sensing:
+        """What an estimator may know besides the observation; only without `scenes`."""
+        if self.family is not None:
+            raise ValueError("scenes must be left out for an estimator, which needs one network")
+        return self._plan.sensing
+
+    @property
+    def bearing_std_rad(self) -> float:
+        """Standard deviation of a bearing; the largest of a family."""
+        return self._plan.bearing_std_rad
+
+    def _known(self, plan: NetworkPlan) -> NetworkPlan:
+        """Return a plan with the standard deviation of the known length, if it is known."""
+        if self.lengths != "one":
+            return plan
+        return dataclasses.replace(plan, length_std_m=_KNOWN * plan.side_m)
+
+    def _restart(
+        self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
+    ) -> dict[str, np.ndarray] | None:
+        told = np.empty(len(chosen), dtype=object)
+        for index, (world, generator) in enumerate(zip(chosen, generators, strict=True)):
+            if self.family is not None:
+                plan, fields = self.family.draw(generator)
+                self._begin_plan(world, self._known(plan))
+                told[index] = json.dumps(fields)
+            plan = self._plans[world]
+            self._positions[world, : plan.n_nodes] = _layout(plan, generator)
+            theta = generator.uniform(-np.pi, np.pi, plan.n_nodes)
+            self._orientations[world, : plan.n_nodes] = proj(theta - theta[0])
         self._measure(chosen, generators)
+        return None if self.family is None else {"scene": told}
 
-    def _layout(self, generator: np.random.Generator) -> FloatArray:
-        """Draw uniform positions in the square, with a connected graph if one is found in time."""
-        positions = np.zeros((self.n_nodes, 2))
-        for _ in range(_TRIES):
-            positions = generator.uniform(0, self.side_m, (self.n_nodes, 2))
-            edges = np.argwhere(np.triu(self._links_of(positions)[0]))
-            if not components(edges, self.n_nodes).any():
-                break
-        return positions
+    def _begin_plan(self, world: int, plan: NetworkPlan) -> None:
+        self._plans[world], self._numbers[world] = plan, numbers_of(plan)
+        self._there[world] = np.arange(self.n_nodes) < plan.n_nodes
+        for field in (self._positions, self._orientations, self._std):
+            field[world] = 0.0
 
-    def _links_of(self, positions: FloatArray) -> tuple[BoolArray, FloatArray]:
-        """Return which nodes see each other (..., n, n), and their displacements (..., n, n, 2)."""
-        apart = positions[..., None, :, :] - positions[..., :, None, :]
-        distance = np.linalg.norm(apart, axis=-1)
-        return (distance <= self.radius_m) & (distance >= self.blind_m), apart
+    def _column(self, name: str, rows: np.ndarray) -> FloatArray:
+        """Return a number of some worlds as (R, 1, 1)."""
+        return self._numbers[rows, COLUMNS.index(name), None, None]
+
+    def _normals(self, rows: np.ndarray, generators: Sequence[np.random.Generator]) -> FloatArray:
+        """Return standard normal variates (R, n, n) for the pairs of nodes of some worlds."""
+        normals = np.zeros((len(rows), self.n_nodes, self.n_nodes))
+        for index, (row, generator) in enumerate(zip(rows, generators, strict=True)):
+            n = self._plans[row].n_nodes
+            normals[index, :n, :n] = generator.standard_normal((n, n))
+        return normals
 
     def _measure(self, rows: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         """Measure links, bearings and the bound of some worlds."""
-        links, apart = self._links_of(self._positions[rows])
+        there, std = self._there[rows], self._column("bearing_std_rad", rows)
+        links, apart = _links_of(
+            self._positions[rows], self._column("radius_m", rows), self._column("blind_m", rows)
+        )
+        links &= there[:, None] & there[..., None]
         toward = np.arctan2(apart[..., 1], apart[..., 0])
-        size = (self.n_nodes, self.n_nodes)
-        normals = np.array([generator.standard_normal(size) for generator in generators])
-        seen = toward - self._orientations[rows][..., None] + self.bearing_std_rad * normals
+        normals = self._normals(rows, generators)
+        seen = toward - self._orientations[rows][..., None] + std * normals
         self._links[rows] = links
         self._bearings[rows] = np.where(links, proj(seen), 0.0)
+        # Missing nodes have no links: they keep their prior and change no other node's bound.
+        others = there[:, 1:]
+        count = others.sum(axis=-1)
         if self.lengths == "none":
-            covariance = linked_covariance(links, self.bearing_std_rad, PRIOR_STD_RAD)
+            covariance = linked_covariance(links, std, PRIOR_STD_RAD)
         else:
             distance = np.linalg.norm(apart, axis=-1)
-            self._lengths[rows] = lengths = self._measured(links, distance, generators)
+            self._lengths[rows] = lengths = self._measured(rows, links, distance, generators)
             covariance = linked_pose_covariance(
-                self._positions[rows], links, lengths > 0, self.sensing
+                self._positions[rows],
+                links,
+                lengths > 0,
+                sensing_of([self._plans[i] for i in rows]),
             )
-            trace = np.trace(covariance, axis1=-2, axis2=-1)
-            self._score_m[rows] = np.sqrt(trace / (self.n_nodes - 1))
-        variance = np.diagonal(covariance, axis1=-2, axis2=-1)[..., : self.n_nodes - 1]
+            each = np.diagonal(covariance, axis1=-2, axis2=-1)
+            trace = (each * np.concatenate([others, np.repeat(others, 2, axis=1)], axis=1)).sum(-1)
+            self._score_m[rows] = np.sqrt(trace / count)
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)[..., : self.n_nodes - 1] * others
         self._std[rows, 1:] = np.sqrt(variance)
-        self._score_rad[rows] = np.sqrt(variance.mean(axis=-1))
+        self._score_rad[rows] = np.sqrt(variance.sum(axis=-1) / count)
 
     def _measured(
-        self, links: BoolArray, distance: FloatArray, generators: Sequence[np.random.Generator]
+        self,
+        rows: np.ndarray,
+        links: BoolArray,
+        distance: FloatArray,
+        generators: Sequence[np.random.Generator],
     ) -> FloatArray:
         """Return the observed lengths (..., n, n), 0 where no length is measured."""
         if self.lengths == "one":
@@ -166,20 +202,21 @@ class PlanarNetworkVectorEnv(BatchEnv):
             worlds = np.arange(len(links))
             known[worlds, 0, other] = known[worlds, other, 0] = True
             return np.where(known & links, distance, 0.0)
-        size = (self.n_nodes, self.n_nodes)
-        normals = np.array([np.triu(g.standard_normal(size), 1) for g in generators])
-        noisy = distance + self.length_std_m * (normals + normals.swapaxes(-1, -2))
+        normals = np.triu(self._normals(rows, generators), 1)
+        noise = self._column("length_std_m", rows) * (normals + normals.swapaxes(-1, -2))
+        longest = np.array([self._plans[i].longest_m for i in rows])[:, None, None]
         # A measured length is positive: 0 means no length.
-        return np.where(links, np.clip(noisy, 1e-9, self._longest), 0.0)
+        return np.where(links, np.clip(distance + noise, 1e-9, longest), 0.0)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         rows = np.flatnonzero(moving)
         if len(rows):
             theta = self._orientations[rows]
-            ahead = self.step_m * np.clip(actions[rows], -1, 1).reshape(len(rows), -1, 2)
+            ahead = np.clip(actions[rows], -1, 1).reshape(len(rows), -1, 2)
+            ahead = self._column("step_m", rows) * ahead * self._there[rows][..., None]
             turn = np.exp(1j * theta) * (ahead[..., 0] + 1j * ahead[..., 1])
             moved = self._positions[rows] + np.stack([turn.real, turn.imag], axis=-1)
-            self._positions[rows] = np.clip(moved, 0.0, self.side_m)
+            self._positions[rows] = np.clip(moved, 0.0, self._column("side_m", rows))
             self._measure(rows, [self._generators[i] for i in rows])
         score = self._score_rad if self.lengths == "none" else self._score_m
         reward = -np.log(score) if self._rewarded else np.zeros(self.num_envs)
@@ -187,7 +224,12 @@ class PlanarNetworkVectorEnv(BatchEnv):
 
     def _observe(self) -> dict[str, np.ndarray]:
         seen = {"bearings": self._bearings.copy(), "links": self._links.astype(np.int8)}
-        return seen if self.lengths == "none" else {**seen, "lengths": self._lengths.copy()}
+        if self.lengths != "none":
+            seen["lengths"] = self._lengths.copy()
+        if self.family is not None:
+            seen["node_mask"] = self._there.astype(np.int8)
+            seen["network"] = self._numbers.copy()
+        return seen
 
     def _inform(self) -> dict[str, np.ndarray]:
         told = {
@@ -199,6 +241,24 @@ class PlanarNetworkVectorEnv(BatchEnv):
 
     def _shot(self) -> tuple[Any, None]:
         return rendering.Network(self._positions, self._orientations, self._links, self._std), None
+
+
+def _layout(plan: NetworkPlan, generator: np.random.Generator) -> FloatArray:
+    """Draw uniform positions in the square, with a connected graph if one is found in time."""
+    positions = np.zeros((plan.n_nodes, 2))
+    for _ in range(_TRIES):
+        positions = generator.uniform(0, plan.side_m, (plan.n_nodes, 2))
+        links, _ = _links_of(positions, plan.radius_m, plan.blind_m)
+        if not components(np.argwhere(np.triu(links)), plan.n_nodes).any():
+            break
+    return positions
+
+
+def _links_of(positions: FloatArray, radius_m: Any, blind_m: Any) -> tuple[BoolArray, FloatArray]:
+    """Return which nodes see each other (..., n, n), and their displacements (..., n, n, 2)."""
+    apart = positions[..., None, :, :] - positions[..., :, None, :]
+    distance = np.linalg.norm(apart, axis=-1)
+    return (distance <= radius_m) & (distance >= blind_m), apart
 
 
 class PlanarNetworkEnv(ScalarEnv):
@@ -269,6 +329,22 @@ class PlanarNetworkEnv(ScalarEnv):
     * `step_m`: longest displacement along an axis.
     * `reward`: ``"bound"`` or ``"none"``.
     * `steps`: length of an episode.
+    * `scenes`: a family of networks, a list of dicts (or one dict) with the numbers above from
+      `n_nodes` to `step_m`. Every reset draws one of them. A value may be a law, see
+      `rbl_gym.worlds.families.SceneFamily`. The other arguments are for fields that a dict does not
+      set:
+    ```python
+    env = gym.make(
+        "rbl_gym:RBL/PlanarNetwork-v0",
+        scenes={"n_nodes": {"integers": [6, 20]}, "radius_m": {"uniform": [3.0, 6.0]}},
+    )
+    ```
+
+    With `scenes` n is the largest number of nodes. Rows of missing nodes are zeros, and they have
+    no links. The observation has two more keys: `node_mask` (n,), int8, 1 for existing nodes, and
+    `network` (6,), float64: `side_m`, `radius_m`, `blind_m`, `bearing_std_rad`, `length_std_m`,
+    `step_m` of the drawn network. `info["scene"]` of the reset has its fields as JSON.
+    `EstimateNetwork` needs one network for all episodes and raises ValueError.
 
     ## Version history
     * v0: first version.
@@ -289,16 +365,22 @@ class PlanarNetworkEnv(ScalarEnv):
         reward: str = "bound",
         steps: int = 50,
         render_mode: str | None = None,
+        scenes: Any = None,
     ) -> None:
         self._configure(
             render_mode, n_nodes=n_nodes, side_m=side_m, radius_m=radius_m, blind_m=blind_m,
             bearing_std_rad=bearing_std_rad, lengths=lengths, length_std_m=length_std_m,
-            step_m=step_m, reward=reward, steps=steps,
+            step_m=step_m, reward=reward, steps=steps, scenes=scenes,
         )  # fmt: skip
 
     @property
+    def family(self) -> NetworkFamily | None:
+        """The family from which every reset draws a network, if there is one."""
+        return self._batch.family
+
+    @property
     def n_nodes(self) -> int:
-        """Number of nodes."""
+        """Number of nodes; the largest of a family."""
         return self._batch.n_nodes
 
     @property

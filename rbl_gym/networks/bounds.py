@@ -69,7 +69,7 @@ def linked_to_0(links: BoolArray) -> BoolArray:
 
 
 class Sensing(NamedTuple):
-    """Sensor noise and prior knowledge of a network."""
+    """Sensor noise and prior knowledge of a network; of several networks arrays (..., 1, 1)."""
 
     bearing_std_rad: float
     length_std_m: float  # of a measured length
@@ -113,9 +113,12 @@ def length_information(links: BoolArray, ranged: BoolArray, sensing: Sensing) ->
 
 
 def prior_information(n_nodes: int, sensing: Sensing) -> FloatArray:
-    """Return the prior information (3 n,), in the order of `bearing_jacobian`."""
-    each = [sensing.prior_std_rad**-2, sensing.prior_std_m**-2]
-    return np.repeat(each, [n_nodes, 2 * n_nodes])
+    """Return the prior information (..., 3 n), in the order of `bearing_jacobian`."""
+    rotation, place = np.asarray(sensing.prior_std_rad), np.asarray(sensing.prior_std_m)
+    each = np.stack(np.broadcast_arrays(rotation, place)) ** -2.0
+    # Fields of several networks are (..., 1, 1).
+    each = each[..., 0, 0] if each.ndim > 1 else each
+    return np.repeat(np.moveaxis(each, 0, -1), [n_nodes, 2 * n_nodes], axis=-1)
 
 
 def pose_information(

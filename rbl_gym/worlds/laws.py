@@ -74,6 +74,19 @@ def count_of_ends(value: Any) -> int:
     return math.prod(count_of_ends(item) for _, item in _items(value))
 
 
+def limits(value: Any) -> tuple[Any, Any]:
+    """Return the smallest and the largest number that a checked law draws, or the number twice."""
+    law = _law_of(value)
+    if law is None:
+        return value, value
+    ((kind, given),) = value.items()
+    if kind == "choice":
+        lows, highs = zip(*map(limits, given), strict=True)
+        return min(lows), max(highs)
+    low, high = given
+    return (int(low), int(high)) if kind == "integers" else (low, high)
+
+
 def corners(value: Any, path: str) -> list[Any]:
     """Return all `ends` of a value after checking it; `path` is its name in errors."""
     check(value, path)
