@@ -198,7 +198,7 @@ def information_at(
     if anchor_std is not None:
         told = _anchor_information(*told, anchor_std)
     elif offset is None:
-        told = _information(*told)
+        told = link_information(*told)
     else:
         told = _offset_information(*told, offsets.code_of(offset))
     if not np.isfinite(told).all():
@@ -207,7 +207,7 @@ def information_at(
 
 
 @compiled("pose_bound:range_information")
-def _information(
+def link_information(
     prior: FloatArray,
     anchors: FloatArray,
     tags: FloatArray,
