@@ -173,7 +173,7 @@ def room_state(n_anchors=6, batch=(2,)):
     seen = scenery.of_task(task, contexts, for_swaps=True)
     bound = swaps.bound_of(seen, scenery.poses_of_task(task, seen, contexts))
     rng, obstacles = np.random.default_rng(1), task.obstacles(contexts)
-    index = np.stack([rng.permutation(240)[:n_anchors] for _ in range(*batch)])
+    index = np.stack([rng.permutation(seen.candidates.shape[-2])[:n_anchors] for _ in range(*batch)])
     points = np.take_along_axis(seen.candidates, index[..., None], axis=-2)
 
     def judged(layouts):
@@ -195,7 +195,7 @@ def test_a_swap_is_nearly_the_best_of_all():
     assert tried.sum() == 2 * 6 * 6
     points, pair = swaps.swapped(state, candidates, tried)
     np.testing.assert_array_equal(pair.sum(axis=(-1, -2)), [1, 1])
-    moved = np.broadcast_to(state.points[:, None, None], (2, 6, 240, 6, 3)).copy()
+    moved = np.broadcast_to(state.points[:, None, None], (2, 6, candidates.shape[-2], 6, 3)).copy()
     for m in range(6):
         moved[:, m, :, m] = candidates
     wide = placement.Context(*(field[:, None, None] for field in contexts))

@@ -44,7 +44,7 @@ _STEP_PLACES, _SPOTS = 256, 512
 # Where something is in the way: numbers of mirror images to compare, and of swaps after them.
 _IMAGES, _SWAPS = 2, 10
 # Contexts whose swaps are done at once.
-_AT_ONCE = 32
+_AT_ONCE = 16
 
 
 class Network(NamedTuple):

@@ -23,7 +23,7 @@ __all__ = ["of_problem", "of_task"]
 
 # Numbers of candidates in a room with obstacles, and on mounts: of which the network is told, and
 # for swaps.
-SHOWN, FOR_SWAPS = {"walls": 48, "mounts": 160}, {"walls": 240, "mounts": 160}
+SHOWN, FOR_SWAPS = {"walls": 48, "mounts": 160}, {"walls": 400, "mounts": 160}
 # Number of positions to judge candidates of a building.
 PLACES = 64
 _KINDS = {Box: "box", Shell: "shell", Walls: "walls"}
