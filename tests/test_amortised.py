@@ -173,7 +173,8 @@ def room_state(n_anchors=6, batch=(2,)):
     seen = scenery.of_task(task, contexts, for_swaps=True)
     bound = swaps.bound_of(seen, scenery.poses_of_task(task, seen, contexts))
     rng, obstacles = np.random.default_rng(1), task.obstacles(contexts)
-    index = np.stack([rng.permutation(seen.candidates.shape[-2])[:n_anchors] for _ in range(*batch)])
+    number = seen.candidates.shape[-2]
+    index = np.stack([rng.permutation(number)[:n_anchors] for _ in range(*batch)])
     points = np.take_along_axis(seen.candidates, index[..., None], axis=-2)
 
     def judged(layouts):
