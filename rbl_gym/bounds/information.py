@@ -232,7 +232,7 @@ def _offset_information(
     share: FloatArray,
     offset: int,
 ) -> FloatArray:
-    """Compute `_information` of ranges with unknown offsets, by the code of their kind."""
+    """Compute `link_information` of ranges with unknown offsets, by the code of their kind."""
     noise, kind = ranging.law_of(law), offsets.name_of(offset)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share, kind)
 
@@ -248,7 +248,7 @@ def _anchor_information(
     share: FloatArray,
     anchor_std: FloatArray,
 ) -> FloatArray:
-    """Compute `_information` for anchor positions with standard deviations (M, 3)."""
+    """Compute `link_information` for anchor positions with standard deviations (M, 3)."""
     noise = ranging.law_of(law)
     return prior + _surveyed_information(
         anchors, tags, rotation, translation, noise, share, anchor_std

@@ -164,6 +164,8 @@ def _square(bound: Bound, information: FloatArray) -> FloatArray:
 def _told(bound: Bound, anchors: FloatArray, share: FloatArray) -> FloatArray:
     """Return the information (..., M, P, 6, 6) of each anchor alone."""
     places, tags = bound.seen.places[..., None, :, :], bound.seen.tags
+    if not anchors.shape[-2]:
+        return np.zeros((*anchors.shape[:-1], places.shape[-2], 6, 6))
     links = np.swapaxes(share, -1, -2)[..., None, None]
     links = np.broadcast_to(links, (*links.shape[:-1], len(tags)))
     return link_information(
