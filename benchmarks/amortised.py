@@ -34,8 +34,8 @@ FAMILIES = {
     "uwb_room, 1 rack": ("uwb_room", 1),
     "uwb_room, 2 racks": ("uwb_room", 2),
 }
-# Anchors of the worlds, in turns; evaluations of the gradient after the network.
-COUNTS, EVALUATIONS = range(3, 13), 20
+# Anchors of the worlds, in turns; evaluations after the network.
+COUNTS, EVALUATIONS = range(3, 13), (0, 6, 20)
 # Random layouts of a problem, and evaluations of the gradient in what is the best known.
 _RANDOM, _LONG = 8, 60
 CMA_EVALUATIONS = 120 * 16
@@ -47,19 +47,23 @@ def one(context: Context, index: int) -> Context:
 
 
 def task_rows(scene: str, racks: int, count: int, worlds: int, options: Any) -> np.ndarray:
-    """Log scores (C, 4) at random, best known, alone, after steps; then seconds of both."""
+    """Log scores at random, best known, and for EVALUATIONS; then seconds of the search and those.
+
+    Shape (worlds, 3 + 2 * len(EVALUATIONS)).
+    """
     task = PlacementTask(scenes.get(scene), count, racks)
     contexts = placement.draw_contexts(task, np.random.default_rng([2026, count]), (worlds,))
     known = kept(
         options, f"{scene}-{racks}-{count}-{worlds}", lambda: searched(task, contexts, count)
     )
-    amortised.of_task(task, one(contexts, 0), 0, options.played)
-    began = time.process_time()
-    alone = amortised.of_task(task, contexts, 0, options.played)
-    seconds = (time.process_time() - began) / worlds
-    stepped = amortised.of_task(task, contexts, EVALUATIONS, options.played)
-    scores = [np.log(placement.score(task, contexts, layout)) for layout in (alone, stepped)]
-    return np.column_stack([known[:, :2], *scores, known[:, 2], np.full(worlds, seconds)])
+    scores, seconds = [], []
+    for number in EVALUATIONS:
+        amortised.of_task(task, one(contexts, 0), number, options.played)
+        began = time.process_time()
+        layouts = amortised.of_task(task, contexts, number, options.played)
+        seconds.append(np.full(worlds, (time.process_time() - began) / worlds))
+        scores.append(np.log(placement.score(task, contexts, layouts)))
+    return np.column_stack([known[:, :2], *scores, known[:, 2], *seconds])
 
 
 def searched(task: PlacementTask, contexts: Context, count: int) -> np.ndarray:
@@ -142,13 +146,14 @@ def building_row(problem: Problem, number: int, options: Any) -> np.ndarray:
     """As a row of `task_rows`, of one building."""
     seen = setting.of_problem(problem, sample(problem, 256))
     known = kept(options, f"building-{number}", lambda: designed(problem, seen))
-    amortised.of_problem(problem, 0, options.played)
-    began = time.process_time()
-    alone = amortised.of_problem(problem, 0, options.played)
-    seconds = time.process_time() - began
-    stepped = amortised.of_problem(problem, EVALUATIONS, options.played)
-    scores = [np.log(seen.score(layout)) for layout in (alone, stepped)]
-    return np.array([*known[:2], *scores, known[2], seconds])
+    scores, seconds = [], []
+    for number in EVALUATIONS:
+        amortised.of_problem(problem, number, options.played)
+        began = time.process_time()
+        layout = amortised.of_problem(problem, number, options.played)
+        seconds.append(time.process_time() - began)
+        scores.append(np.log(seen.score(layout)))
+    return np.array([*known[:2], *scores, known[2], *seconds])
 
 
 def designed(problem: Problem, seen: setting.Setting) -> np.ndarray:
@@ -177,7 +182,8 @@ def main() -> None:
     if options.network:
         options.played = amortised.read(Path(options.network))
     asked = options.families.split(",") if options.families else [*FAMILIES, "buildings"]
-    print(f"{'':20} alone  [95 %]           after {EVALUATIONS}   time/search  worst alone")
+    heads = (f"{f'after {n}':>6}  [95 %]        time" for n in EVALUATIONS)
+    print(f"{'':18}", *(f"{head:31}" for head in heads), "  worst of one pass")
     for name, (scene, racks) in FAMILIES.items():
         if not any(name.startswith(one) for one in asked):
             continue
@@ -201,20 +207,18 @@ def main() -> None:
 
 
 def print_row(name: str, rows: np.ndarray) -> None:
-    """One family: normalised values of means, an interval by the bootstrap over problems."""
+    """One family: normalised values of means, intervals by the bootstrap over problems, times."""
     index = np.random.default_rng(0).integers(len(rows), size=(1000, len(rows)))
 
     def normalised(means: np.ndarray, column: int) -> Any:
         return (means[..., 0] - means[..., column]) / (means[..., 0] - means[..., 1])
 
-    low, high = np.quantile(normalised(rows[index].mean(axis=1), 2), [0.025, 0.975])
-    means = rows.mean(axis=0)
-    worst = normalised(rows, 2).min()
-    print(
-        f"{name:20} {normalised(means, 2):.4f} [{low:.4f}, {high:.4f}]  {normalised(means, 3):.4f}"
-        f"     1/{means[4] / means[5]:.0f}  {worst:.3f}",
-        flush=True,
-    )
+    means, columns, n = rows.mean(axis=0), [], len(EVALUATIONS)
+    for column in range(2, 2 + n):
+        low, high = np.quantile(normalised(rows[index].mean(axis=1), column), [0.025, 0.975])
+        share = means[2 + n] / means[column + 1 + n]
+        columns.append(f"{normalised(means, column):.4f} [{low:.4f}, {high:.4f}]  1/{share:<6.0f}")
+    print(f"{name:18}", *columns, f"  {normalised(rows, 2).min():.3f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from rbl_gym.app.cli import READER_GONE
+from rbl_gym.app.cli import READER_GONE, main
 from tests.helpers import ROOT
 
 LOG = ROOT / "examples" / "log"
@@ -53,6 +53,12 @@ def test_a_command_without_a_reader_ends_quietly(arguments):
 
 def test_a_command_ends_quietly_if_nobody_reads_its_errors_either():
     assert ended(["replay", "--ranges", "nowhere.csv"], together=True)[0] == READER_GONE
+
+
+def test_without_a_command_all_commands_are_listed(capsys):
+    assert main([]) == 2
+    told = capsys.readouterr().err
+    assert all(f"    {name} " in told for name in ("demo", "place", "replay", "studio"))
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")

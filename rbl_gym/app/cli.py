@@ -49,7 +49,11 @@ def _flush() -> None:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help(sys.stderr)
+        return 2
     # MODULE:FACTORY may be in a file of the working folder, which only `python -m` would search.
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
@@ -74,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="rbl-gym", description="Localization of rigid bodies by radio."
     )
     parser.add_argument("--version", action="version", version=f"rbl-gym {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
+    commands = parser.add_subparsers(dest="command", metavar="command")
     paper_commands.add_demo(commands)
     place_command.add_place(commands)
     plan_command.add_plan(commands)

@@ -82,8 +82,8 @@ def add_place(commands: Any) -> None:
         "--start",
         choices=("search", "amortised"),
         default="search",
-        help="amortised: start from the layout of a trained network and take at most 20 steps, "
-        "instead of the search",
+        help="amortised: start from the layout of a trained network and evaluate the score at most "
+        "20 times, instead of the search",
     )
     place.add_argument(
         "--racks",

@@ -198,7 +198,7 @@ def information_at(
     if anchor_std is not None:
         told = _anchor_information(*told, anchor_std)
     elif offset is None:
-        told = _information(*told)
+        told = link_information(*told)
     else:
         told = _offset_information(*told, offsets.code_of(offset))
     if not np.isfinite(told).all():
@@ -207,7 +207,7 @@ def information_at(
 
 
 @compiled("pose_bound:range_information")
-def _information(
+def link_information(
     prior: FloatArray,
     anchors: FloatArray,
     tags: FloatArray,
@@ -232,7 +232,7 @@ def _offset_information(
     share: FloatArray,
     offset: int,
 ) -> FloatArray:
-    """Compute `_information` of ranges with unknown offsets, by the code of their kind."""
+    """Compute `link_information` of ranges with unknown offsets, by the code of their kind."""
     noise, kind = ranging.law_of(law), offsets.name_of(offset)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share, kind)
 
@@ -248,7 +248,7 @@ def _anchor_information(
     share: FloatArray,
     anchor_std: FloatArray,
 ) -> FloatArray:
-    """Compute `_information` for anchor positions with standard deviations (M, 3)."""
+    """Compute `link_information` for anchor positions with standard deviations (M, 3)."""
     noise = ranging.law_of(law)
     return prior + _surveyed_information(
         anchors, tags, rotation, translation, noise, share, anchor_std

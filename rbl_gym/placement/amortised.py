@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+from collections.abc import Callable
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -17,14 +18,13 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.geometry.obstacles import Obstacles
-from rbl_gym.geometry.regions import Region, Walls
-from rbl_gym.placement import scenery, setting
+from rbl_gym.geometry.regions import Box, Region, Shell, Walls
+from rbl_gym.placement import scenery, setting, swaps
 from rbl_gym.placement.building import Problem, cube
 from rbl_gym.placement.descent import descend
-from rbl_gym.placement.problem import Context, PlacementTask, score_of_checked
+from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.placement.sample import sample
 from rbl_gym.placement.tokens import (
-    IMAGES,
     KINDS,
     Scenery,
     Tokens,
@@ -41,6 +41,10 @@ _FILE = "amortised.npz"
 # Numbers of positions for the score and gradient of a building, and of legal positions tried
 # instead of one inside an obstacle.
 _STEP_PLACES, _SPOTS = 256, 512
+# Where something is in the way: numbers of mirror images to compare, and of swaps after them.
+_IMAGES, _SWAPS = 2, 10
+# Contexts whose swaps are done at once.
+_AT_ONCE = 16
 
 
 class Network(NamedTuple):
@@ -60,7 +64,7 @@ def read(path: Any) -> Network:
     """Read a network from a file written by the training: a path, or an object with `open`."""
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         meta = json.loads(str(arrays["meta"]))
-        weights = {name: arrays[name].astype(float) for name in arrays.files if name != "meta"}
+        weights = {name: arrays[name].astype(np.float32) for name in arrays.files if name != "meta"}
     return Network(weights, meta)
 
 
@@ -105,9 +109,10 @@ def forward(
         Number of placed anchors, and of all anchors with the fixed ones.
     """
     w = weights
-    width = w["ordinal"].shape[1]
+    width, numbers = w["ordinal"].shape[1], w["ordinal"].dtype
+    tokens = Tokens(*(rows.astype(numbers) for rows in tokens))
     batch = tokens.world.shape[:-2]
-    ring = pattern(count)
+    ring = pattern(count).astype(numbers)
     anchors = w["ordinal"][:count] + w["count"][min(total, MOST) - 1] + ring @ w["pattern.weight"]
     rows, masks = [], []
     for kind in ("world", "zones", "obstacles", "fixed"):
@@ -159,33 +164,75 @@ def _silu(x: FloatArray) -> FloatArray:
     return x / (1 + np.exp(-x))
 
 
-def places(network: Network, seen: Scenery, count: int, image: int = 0) -> FloatArray:
-    """Return positions (..., M, 3) of `count` anchors, not yet legal on boxes, shells and walls.
+class _Play(NamedTuple):
+    """A problem with all that the network needs.
 
-    On walls a position stands for the ray from the centre of the room, see `Walls.place`. The
-    network is applied to one of the eight mirror images of the problem.
+    Attributes
+    ----------
+    seen
+        Input of the network.
+    share
+        Returns the information fractions (..., P, M) of the links of anchors (..., M, 3).
+    legal
+        Returns legal positions (..., M, 3) for points of any kind.
+    count
+        Number of anchors to place.
     """
-    if image:
-        seen = turned(seen, image)
-    total = count + seen.fixed.shape[-2]
-    steps, scores = forward(network.weights, tokens_of(seen, count), count, total)
+
+    seen: Scenery
+    share: Callable[[FloatArray], FloatArray]
+    legal: Callable[[FloatArray], FloatArray]
+    count: int
+
+
+def _placed(network: Network, play: _Play, image: int = 0) -> FloatArray:
+    """Return anchors (..., M, 3) of one pass of the network, on one of the mirror images."""
+    seen = turned(play.seen, image) if image else play.seen
+    total = play.count + seen.fixed.shape[-2]
+    steps, scores = forward(network.weights, tokens_of(seen, play.count), play.count, total)
     if KINDS[seen.kind] == "mounts":
-        return turned_points(_chosen(scores, seen.candidates), image, back=True)
-    origin, unit = seen.frame()
-    return turned_points(origin[..., None, :] + unit[..., None, None] * steps, image, back=True)
+        index = _chosen(scores)
+        return np.take_along_axis(play.seen.candidates, index[..., None], axis=-2)
+    _, unit = seen.frame()
+    points = seen.aim()[..., None, :] + unit[..., None, None] * steps
+    return play.legal(turned_points(points, image, back=True))
 
 
-def _chosen(scores: FloatArray, candidates: FloatArray) -> FloatArray:
-    """Return the candidates (..., M, 3) with the largest scores (..., M, C), each at most once."""
+def _chosen(scores: FloatArray) -> np.ndarray:
+    """Return the candidates (..., M) with the largest scores (..., M, C), each at most once."""
     scores = scores.copy()
     found = []
     for m in range(scores.shape[-2]):
         best = scores[..., m, :].argmax(axis=-1)[..., None]
         found.append(best)
-        if candidates.shape[-2] > m + 1:
+        if scores.shape[-1] > m + 1:
             np.put_along_axis(scores, best[..., None, :], -np.inf, axis=-1)
-    index = np.concatenate(found, axis=-1)
-    return np.take_along_axis(candidates, index[..., None], axis=-2)
+    return np.concatenate(found, axis=-1)
+
+
+def _swapped(
+    network: Network, play: _Play, poses: swaps.Poses, evaluations: int
+) -> tuple[FloatArray, int]:
+    """Return anchors (..., M, 3) after mirror images and swaps, and the number of evaluations."""
+    bound, candidates = swaps.bound_of(play.seen, poses), play.seen.candidates
+
+    def judged(points: FloatArray) -> swaps.State:
+        return swaps.judged(bound, points, play.share(points))
+
+    best, used = judged(_placed(network, play)), 1
+    for image in range(1, min(_IMAGES, evaluations)):
+        best, _ = swaps.better(best, judged(_placed(network, play, image)))
+        used += 1
+    away = np.abs(play.legal(candidates) - candidates).max(axis=-1)
+    illegal = (away > 1e-6 * play.seen.frame()[1][..., None])[..., None, :]
+    tried = illegal | swaps.standing(best.points, candidates)
+    while used < min(_IMAGES + _SWAPS, evaluations) and (best.promise > 0)[~tried].any():
+        points, pair = swaps.swapped(best, candidates, tried)
+        best, is_new = swaps.better(best, judged(points))
+        fresh = illegal | swaps.standing(best.points, candidates)
+        tried = np.where(is_new[..., None, None], fresh, tried | pair)
+        used += 1
+    return best.points, used
 
 
 def of_task(
@@ -201,9 +248,10 @@ def of_task(
     task, context
         The problems; 1 to 16 anchors.
     evaluations
-        Largest number of score evaluations after the network. If there are obstacles, up to 8 of
-        them compare the network's layouts for mirror images of the problem. The others, with the
-        gradient, are for gradient steps. 0: none.
+        Largest number of evaluations of the score and its derivatives after the network. With
+        obstacles, or on mounts, the first 2 compare the network's layouts for the problem and a
+        mirror image, up to 10 are swaps of an anchor for a candidate, see `swaps`. The others are
+        for gradient steps. 0: none.
     network
         None selects the network of the package.
 
@@ -214,24 +262,34 @@ def of_task(
     """
     check_count("n_anchors", task.n_anchors, least=1, most=MOST)
     evaluations = check_count("evaluations", evaluations, least=0)
-    seen, network = scenery.of_task(task, context), network or load()
-    region, in_the_way = task.scene.anchor_region, task.scene.obstruction
-    images = _images(evaluations, bool(task.obstacles(context)))
-    found = np.stack(
-        [
-            _legal(region, in_the_way, seen, places(network, seen, task.n_anchors, image))
-            for image in range(images)
+    batch, network = context.centre.shape[:-1], network or load()
+    swap = evaluations > 1 and bool(task.obstacles(context))
+    if swap and math.prod(batch) > _AT_ONCE:
+        flat = [field.reshape(-1, *field.shape[len(batch) :]) for field in context]
+        some = [slice(k, k + _AT_ONCE) for k in range(0, len(flat[0]), _AT_ONCE)]
+        found = [
+            of_task(task, Context(*(field[part] for field in flat)), evaluations, network)
+            for part in some
         ]
-    )
-    if images > 1:
-        scores = score_of_checked(task, context, found)
-        found = np.take_along_axis(found, scores.argmin(axis=0)[None, ..., None, None], axis=0)
-        evaluations -= images
-    found = found[0]
-    if evaluations:
-        for where in np.ndindex(found.shape[:-2]):
+        return np.concatenate(found).reshape(*batch, task.n_anchors, 3)
+    seen = scenery.of_task(task, context, swap)
+
+    def legal(points: FloatArray) -> FloatArray:
+        return _legal(task.scene.anchor_region, task.scene.obstruction, points)
+
+    def share(points: FloatArray) -> FloatArray:
+        return task.obstacles(context).share(points, seen.places)
+
+    play, used = _Play(seen, share, legal, task.n_anchors), 0
+    if swap:
+        poses = scenery.poses_of_task(task, seen, context)
+        found, used = _swapped(network, play, poses, evaluations)
+    else:
+        found = _placed(network, play)
+    if evaluations > used:
+        for where in np.ndindex(batch):
             one = setting.of_task(task, Context(*(field[where] for field in context)))
-            found[where], _ = descend(one, found[where], evaluations)
+            found[where], _ = descend(one, found[where], evaluations - used, strict=True)
     return found
 
 
@@ -257,34 +315,33 @@ def of_problem(
         return problem.fixed.copy()
     check_count("the number of anchors to place", count, least=1, most=MOST)
     evaluations = check_count("evaluations", evaluations, least=0)
-    seen, network = scenery.of_problem(problem), network or load()
+    drawn = sample(problem, scenery.PLACES)
+    smooth = isinstance(problem.mounts, Box | Shell | Walls) and not problem.obstacles
+    swap = evaluations > 1 and not smooth
+    seen, network = scenery.of_problem(problem, drawn, swap), network or load()
     if KINDS[seen.kind] == "mounts" and len(seen.candidates) < count:
         raise ValueError("anchors have no permitted place: obstacles cover all of them")
-    smooth = KINDS[seen.kind] != "mounts" and not problem.obstacles
-    found = [
-        _legal(problem.mounts, problem.obstacles, seen, places(network, seen, count, image))
-        for image in range(_images(evaluations, not smooth))
-    ]
-    if not evaluations:
-        return np.concatenate([problem.fixed, found[0]])
-    judged = setting.of_problem(problem, sample(problem, _STEP_PLACES))
-    if len(found) > 1:
-        found.sort(key=judged.score)
-        evaluations -= len(found)
-    if evaluations:
-        found[0], _ = descend(judged, found[0], evaluations)
-    return np.concatenate([problem.fixed, found[0]])
+
+    def legal(points: FloatArray) -> FloatArray:
+        return _legal(problem.mounts, problem.obstacles, points)
+
+    def share(points: FloatArray) -> FloatArray:
+        return problem.share(points, seen.places)
+
+    play, used = _Play(seen, share, legal, count), 0
+    if swap:
+        poses = scenery.poses_of_problem(problem, drawn)
+        found, used = _swapped(network, play, poses, evaluations)
+    else:
+        found = _placed(network, play)
+    if evaluations > used:
+        judged = setting.of_problem(problem, sample(problem, _STEP_PLACES))
+        found, _ = descend(judged, found, evaluations - used, strict=True)
+    return np.concatenate([problem.fixed, found])
 
 
-def _images(evaluations: int, in_the_way: bool) -> int:
-    """Return the number of mirror images to compare."""
-    return min(max(evaluations, 1), IMAGES) if in_the_way else 1
-
-
-def _legal(region: Region, obstacles: Obstacles, seen: Scenery, points: FloatArray) -> FloatArray:
+def _legal(region: Region, obstacles: Obstacles, points: FloatArray) -> FloatArray:
     """Return legal positions (..., M, 3) for points, outside of obstacles."""
-    if KINDS[seen.kind] == "mounts":
-        return points
     if isinstance(region, Walls):
         action = region.action(points)
         points = region.place(action / np.maximum(np.abs(action).max(axis=-1, keepdims=True), 1.0))

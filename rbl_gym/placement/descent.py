@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from typing import Any
 
 import numpy as np
@@ -16,10 +18,23 @@ __all__ = ["descend"]
 _UNIT = 0.1
 
 
+class _SpentError(Exception):
+    """No evaluations are left."""
+
+
 def descend(
-    setting: Setting, anchors: FloatArray, evaluations: int = 30
+    setting: Setting, anchors: FloatArray, evaluations: int = 30, strict: bool = False
 ) -> tuple[FloatArray, float]:
     """Minimize the log of the score of all anchors (M, 3) by L-BFGS-B, each within its face.
+
+    Parameters
+    ----------
+    setting, anchors
+        The problem, and where to begin.
+    evaluations
+        Largest number of evaluations of score and gradient.
+    strict
+        Whether to stop at that number within a line search. Otherwise the last one is finished.
 
     Returns
     -------
@@ -36,8 +51,11 @@ def descend(
         start = np.einsum("mai,mi->ma", axes, anchors - origin).clip(0.0, extents)
         limits = np.stack([np.zeros(start.shape), extents / unit], axis=-1).reshape(-1, 2)
     best: list[Any] = [anchors, np.inf]
+    left = itertools.count(evaluations, -1)
 
     def evaluate(values: FloatArray) -> tuple[float, FloatArray]:
+        if not next(left) and strict:
+            raise _SpentError
         values = unit * values.reshape(-1, 3)
         if limits is None:
             layout = region.project(values)
@@ -52,14 +70,15 @@ def descend(
             slope = np.einsum("mai,mi->ma", axes, gradient)
         return float(np.log(score)), (slope * (unit / score)).ravel()
 
-    optimize.minimize(
-        evaluate,
-        (start / unit).ravel(),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=limits,
-        options={"maxfun": evaluations, "maxiter": evaluations, "ftol": 1e-7, "gtol": 1e-6},
-    )
+    with contextlib.suppress(_SpentError):
+        optimize.minimize(
+            evaluate,
+            (start / unit).ravel(),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=limits,
+            options={"maxfun": evaluations, "maxiter": evaluations, "ftol": 1e-7, "gtol": 1e-6},
+        )
     found, score = best
     legal = setting.legal(found)
     if legal.all():

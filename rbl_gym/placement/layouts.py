@@ -113,8 +113,8 @@ def amortised(
     task, context, rng
         As in `layout`; 1 to 16 anchors. Nothing is random.
     evaluations
-        Largest number of evaluations of score and gradient, in gradient steps after the network; 0:
-        none.
+        Largest number of evaluations of the score and its derivatives after the network, in swaps
+        and gradient steps; 0: none.
     """
     return network.of_task(task, context, evaluations)
 

@@ -15,20 +15,25 @@ from rbl_gym.measurements import ranging
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import ATTITUDES, Problem, cube
 from rbl_gym.placement.problem import Context, PlacementTask, positions
-from rbl_gym.placement.sample import sample
+from rbl_gym.placement.sample import Sample
+from rbl_gym.placement.swaps import Poses
 from rbl_gym.placement.tokens import KINDS, Scenery
 
 __all__ = ["of_problem", "of_task"]
 
-# Numbers of candidates in a room with obstacles, and on mounts; positions to judge the latter.
-ROOM_CANDIDATES, _CANDIDATES, _PLACES = 48, 160, 64
+# Numbers of candidates in a room with obstacles, and on mounts: of which the network is told, and
+# for swaps.
+SHOWN, FOR_SWAPS = {"walls": 48, "mounts": 160}, {"walls": 400, "mounts": 160}
+# Number of positions to judge candidates of a building.
+PLACES = 64
 _KINDS = {Box: "box", Shell: "shell", Walls: "walls"}
 
 
-def of_task(task: PlacementTask, context: Context) -> Scenery:
-    """Return the scenery of a task in contexts (...)."""
+def of_task(task: PlacementTask, context: Context, for_swaps: bool = False) -> Scenery:
+    """Return the scenery of a task in contexts (...); swaps need more candidates."""
     scene = task.scene
     batch = context.centre.shape[:-1]
+    fixed = np.array(scene.fixed).reshape(-1, 3)
     zone = np.concatenate([context.centre, context.half, np.zeros((*batch, 4))], axis=-1)
     zone[..., 6:8] = 1.0
     left = np.broadcast_to(scene.blocked_information, (*context.racks.shape[:-1], 1))
@@ -38,8 +43,9 @@ def of_task(task: PlacementTask, context: Context) -> Scenery:
         task.obstacles(context),
         np.concatenate([context.racks, left], axis=-1),
         Gain(),
+        for_swaps,
         zones=zone[..., None, :],
-        fixed=np.zeros((*batch, 0, 3)),
+        fixed=np.broadcast_to(fixed, (*batch, *fixed.shape)),
         tags=scene.body,
         noise=_noise(scene.noise, len(scene.tags)),
         extent=np.full(batch, extent),
@@ -48,8 +54,26 @@ def of_task(task: PlacementTask, context: Context) -> Scenery:
     )
 
 
-def of_problem(problem: Problem) -> Scenery:
-    """Return the scenery of a building."""
+def poses_of_task(task: PlacementTask, seen: Scenery, context: Context) -> Poses:
+    """Return the poses of the scenery of a task."""
+    return Poses(
+        task.poses[0],
+        np.full(task.n_poses, 1 / task.n_poses),
+        np.broadcast_to(task.prior_information, (task.n_poses, 6, 6)),
+        task.obstacles(context).share(seen.fixed, seen.places),
+        _law(task.scene.noise, len(task.scene.tags)),
+    )
+
+
+def poses_of_problem(problem: Problem, drawn: Sample) -> Poses:
+    """Return the poses of the scenery of a building."""
+    share = problem.share(problem.fixed, drawn.places)
+    law = _law(problem.noise, len(problem.tags))
+    return Poses(drawn.rotation, drawn.weight, drawn.prior, share, law)
+
+
+def of_problem(problem: Problem, drawn: Sample, for_swaps: bool = False) -> Scenery:
+    """Return the scenery of a building, candidates judged at the positions of a sample."""
     rows = []
     for zone in problem.zones:
         low, high = zone.bounds()
@@ -61,21 +85,26 @@ def of_problem(problem: Problem) -> Scenery:
         problem.obstacles,
         _rows_of(problem.obstacles),
         problem.gain,
+        for_swaps,
         zones=np.array(rows),
         fixed=problem.fixed,
         tags=problem.tags,
         noise=_noise(problem.noise, len(problem.tags)),
         extent=np.asarray(np.ptp([low, high], axis=0).max()),
         even=True,
-        places=sample(problem, _PLACES).places,
+        places=drawn.places,
     )
+
+
+def _law(noise: ranging.NoiseLaw, n_tags: int) -> FloatArray:
+    numbers = ranging.numbers_of(noise, n_tags)
+    assert numbers is not None  # the laws of scenes have numbers
+    return numbers
 
 
 def _noise(noise: ranging.NoiseLaw, n_tags: int) -> FloatArray:
     """Return standard deviation at the anchor and growth (2,); squared ranges as ranges."""
-    numbers = ranging.numbers_of(noise, n_tags)
-    assert numbers is not None  # the laws of scenes have numbers
-    squared, first, second, _ = numbers.tolist()
+    squared, first, second, _ = _law(noise, n_tags).tolist()
     return np.array([0.5 * first, 0.0] if squared else [first, second])
 
 
@@ -92,17 +121,24 @@ def _rows_of(obstacles: Obstacles) -> FloatArray:
 
 
 def _scenery(
-    region: Region, obstacles: Obstacles, rows: FloatArray, gain: Gain, **known: Any
+    region: Region,
+    obstacles: Obstacles,
+    rows: FloatArray,
+    gain: Gain,
+    for_swaps: bool,
+    **known: Any,
 ) -> Scenery:
     """Return the remaining fields from the region, the obstacles, and the gain."""
     zones, places = known["zones"], known["places"]
     batch = zones.shape[:-2]
     kind = _KINDS.get(type(region), "mounts")
-    spots = np.zeros((0, 3))
+    spots, shown = np.zeros((0, 3)), SHOWN.get(kind, 0)
+    number = FOR_SWAPS[kind] if for_swaps and kind in SHOWN else shown
     if kind == "mounts":
-        spots = _spots(region, obstacles)
+        spots = _spots(region, obstacles, number)
+        shown = shown if region.listed() is None else len(spots)
     elif kind == "walls" and obstacles:
-        spots = region.draw(cube(ROOM_CANDIDATES))
+        spots = region.draw(cube(number))
     candidates, normals = (
         np.broadcast_to(x, (*batch, *x.shape)) for x in (spots, region.normal(spots))
     )
@@ -127,17 +163,18 @@ def _scenery(
         candidates=candidates,
         normals=normals,
         seen=seen,
+        shown=shown,
         **known,
     )
 
 
-def _spots(region: Region, obstacles: Obstacles) -> FloatArray:
+def _spots(region: Region, obstacles: Obstacles, number: int) -> FloatArray:
     """Return legal positions (C, 3) on mounts: all of a list, else some spread evenly."""
     spots = region.listed()
     if spots is None:
-        spots = _scaled_draw(region, cube(2 * _CANDIDATES))
+        spots = _scaled_draw(region, cube(2 * number))
     free = spots[~obstacles.contain(spots)]
-    return free[:_CANDIDATES] if region.listed() is None else free
+    return free[:number] if region.listed() is None else free
 
 
 def _scaled_draw(region: Region, uniforms: FloatArray) -> FloatArray:

@@ -16,8 +16,6 @@ __all__ = ["KINDS", "Scenery", "Tokens", "tokens_of"]
 
 # Kinds of regions. "mounts" is any other, with candidates for the anchors.
 KINDS = ("box", "shell", "walls", "mounts")
-# Mirror images of a problem, itself first.
-IMAGES = 8
 # Cells of the plan of the zones, in x and in y, for the views of candidates.
 _CELLS = 3
 # Lengths of zero, and noise that does not grow, are replaced by this fraction of the unit.
@@ -60,6 +58,8 @@ class Scenery(NamedTuple):
     candidates, normals, seen
         Legal positions (..., C, 3), their normals, and the information fractions (..., P, C) of
         their links. C may be 0.
+    shown
+        Number of candidates, the first ones, of which there are tokens; None: all.
     """
 
     kind: int
@@ -79,6 +79,7 @@ class Scenery(NamedTuple):
     candidates: FloatArray
     normals: FloatArray
     seen: FloatArray
+    shown: int | None = None
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """Return corners (..., 3) of the box around all zones."""
@@ -97,6 +98,13 @@ class Scenery(NamedTuple):
         square = 0.5 * (half[..., :2] ** 2).sum(axis=-1) + self.nearest**2
         span = np.sqrt(((self.high - self.low) ** 2).sum(axis=-1))
         return origin, np.maximum(np.sqrt(square), 1e-3 * span)
+
+    def aim(self) -> FloatArray:
+        """Return the position (..., 3) in the box around the region that is nearest to the zones.
+
+        The network's steps begin there.
+        """
+        return self.frame()[0].clip(self.low, self.high)
 
 
 def turned(seen: Scenery, image: int) -> Scenery:
@@ -157,16 +165,22 @@ def tokens_of(seen: Scenery, count: int) -> Tokens:
     real = (seen.zones[..., 6:7] > 0).astype(float)
     weight = seen.zones[..., 6:7] / seen.zones[..., 6:7].sum(axis=-2, keepdims=True)
     half = seen.zones[..., 3:6] / by
-    zones = [real, _place((seen.zones[..., :3] - at) / by), _size(half), weight]
+    zones = [real, place_row((seen.zones[..., :3] - at) / by), _size(half), weight]
     solid = (seen.obstacles[..., 3:4] > 0).astype(float)
     share = seen.obstacles[..., 6:7]
     half = seen.obstacles[..., 3:6] / by
     centre = (seen.obstacles[..., :3] - at) / by
-    obstacles = [solid, _place(centre), _size(half), share, np.log10(share + 1e-3) / 3]
+    obstacles = [solid, place_row(centre), _size(half), share, np.log10(share + 1e-3) / 3]
     one = np.ones((*seen.fixed.shape[:-1], 1))
-    fixed = [one, _place((seen.fixed - at) / by)]
+    fixed = [one, place_row((seen.fixed - at) / by)]
+    if seen.shown is not None:
+        seen = seen._replace(
+            candidates=seen.candidates[..., : seen.shown, :],
+            normals=seen.normals[..., : seen.shown, :],
+            seen=seen.seen[..., : seen.shown],
+        )
     one = np.ones((*seen.candidates.shape[:-1], 1))
-    where = _place((seen.candidates - at) / by)
+    where = place_row((seen.candidates - at) / by)
     candidates = [one, where, seen.normals, _views(seen)]
     return Tokens(
         _world(seen, count, origin, unit)[..., None, :],
@@ -212,8 +226,8 @@ def _world(seen: Scenery, count: int, origin: FloatArray, unit: FloatArray) -> F
         limit / (1 + limit),
         np.broadcast_to(sees, batch),
     ]
-    region = [_place((seen.low - origin) / by), _place((seen.high - origin) / by)]
-    middle = _place((0.5 * (seen.low + seen.high) - origin) / by)
+    region = [place_row((seen.low - origin) / by), place_row((seen.high - origin) / by)]
+    middle = place_row((0.5 * (seen.low + seen.high) - origin) / by)
     size = _size(0.5 * (seen.high - seen.low) / by)
     work = _size(0.5 * (high - low) / by)
     return _joined(np.stack(told, axis=-1), kind, axes, *region, middle, size, work)
@@ -233,7 +247,7 @@ def _views(seen: Scenery) -> FloatArray:
     return _joined(np.where(number[..., None, :] > 0, told, mean), mean)
 
 
-def _place(x: FloatArray) -> FloatArray:
+def place_row(x: FloatArray) -> FloatArray:
     """Return coordinates (..., 3) on a near and a far scale as (..., 6)."""
     return _joined(np.minimum(np.maximum(x, -3.0), 3.0), 0.5 * np.arcsinh(x))
 

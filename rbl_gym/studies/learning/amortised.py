@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
+from rbl_gym.bounds.information import link_information
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.problem import weighted_square
 from rbl_gym.placement.tokens import KINDS, Tokens, tokens_of
-from rbl_gym.studies.learning import placement_families
+from rbl_gym.studies.learning import placement_families, random_buildings
 from rbl_gym.studies.learning.random_problems import Batch
 from rbl_gym.studies.learning.torch_layouts import (
     Case,
@@ -41,16 +42,17 @@ from rbl_gym.studies.learning.torch_layouts import (
 
 __all__ = ["save", "train"]
 
-# Problems of each family per step, in the first round and later; buildings take part in every
-# second step only.
+# Problems of each family per step, in the first round and later.
 GROUPS = (
     (("boxes", 32), ("boxes", 32), ("boxes", 32), ("shells", 16), ("rooms", 32), ("buildings", 16)),
-    (("boxes", 32), ("boxes", 32), ("shells", 8), ("rooms", 32), ("rooms", 32), ("buildings", 16)),
+    (("boxes", 32), ("boxes", 32), ("shells", 8), ("rooms", 32), ("rooms", 32), ("buildings", 24)),
 )
 # Steps of the rounds that trained the package's network.
-STEPS = (5000, 1500)
+STEPS = (4200, 3000)
 # Anchors of a building whose choice gets a gradient in a step.
-_CHOICES = 1
+_CHOICES = 2
+# Steps with the same buildings, each with other bodies, noise and mirror images.
+_AGAIN = 4
 # Peak learning rates of the first round and of the others; warm-up steps; initial weight of the
 # entropy of choices.
 _RATES, _WARM, _ENTROPY = (2e-3, 1e-3), 150, 0.02
@@ -111,7 +113,9 @@ def loss_of(
     kind = KINDS[batch.seen.kind]
     if kind == "mounts":
         return _choice_loss(case, batch, scores, entropy, generator)
-    anchors = legal(kind, case, steps)
+    origin, unit = batch.seen.frame()
+    aim = torch.as_tensor((batch.seen.aim() - origin) / unit[:, None], dtype=torch.float32)
+    anchors = legal(kind, case, aim[:, None] + steps)
     if case.boxes.shape[1]:
         case = some_poses(case, generator)
         told = information(case, anchors, sight(case, anchors, blur))
@@ -131,11 +135,7 @@ def _choice_loss(
     with torch.no_grad():
         origin, unit = batch.seen.frame()
         spots = (batch.seen.candidates - origin[:, None]) / unit[:, None, None]
-        told = parts(
-            case,
-            torch.as_tensor(spots, dtype=torch.float32),
-            torch.as_tensor(batch.seen.seen, dtype=torch.float32),
-        )
+        told = torch.as_tensor(alone(case, spots, batch.seen.seen))
         drawn = torch.multinomial(shares.flatten(0, 1), 1, generator=generator)
         drawn = drawn.view(size, count)
         at = torch.arange(size)[:, None]
@@ -155,6 +155,19 @@ def _choice_loss(
     spread = -(shares * logs.clamp(min=-30)).sum(dim=-1)
     loss = expected.sum(dim=-1).mean() * (count / len(which)) - entropy * spread.sum(dim=-1).mean()
     return loss, float(mean)
+
+
+def alone(case: Case, spots: FloatArray, share: FloatArray) -> FloatArray:
+    """Information (B, C, P, 6, 6) of each candidate (B, C, 3) alone; shares (B, P, C)."""
+    tags, rotation, places = (x.double().numpy() for x in (case.tags, case.rotation, case.places))
+    floor, growth = case.floor.double().numpy(), case.growth.double().numpy()
+    law = np.stack([0 * floor, floor, growth, 0 * floor - 1], axis=-1)
+    links = np.swapaxes(share, 1, 2)[..., None, None]
+    return link_information(
+        np.zeros((6, 6)), spots[:, :, None, None], tags[:, None, None], rotation[:, None],
+        places[:, None], law[:, None, None],
+        np.broadcast_to(links, (*links.shape[:-1], tags.shape[1])),
+    )  # fmt: skip
 
 
 def train(
@@ -199,7 +212,7 @@ def _round(
     mean_of = {name: value.detach().clone() for name, value in network.weights.items()}
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATES[turn > 0], weight_decay=1e-3)
     means: dict[str, list[float]] = {}
-    groups = GROUPS[turn > 0]
+    groups, floors = GROUPS[turn > 0], None
     begin = time.process_time()
     for number in range(steps):
         done = number / steps
@@ -209,8 +222,13 @@ def _round(
         blur = _BLUR[0] * (_BLUR[1] / _BLUR[0]) ** min(1.0, turn + 1.5 * done)
         entropy = 0.0 if turn else _ENTROPY * max(0.0, 1 - 2 * done)
         optimizer.zero_grad()
-        for family, size in groups if number % 2 else groups[:-1]:
-            batch = placement_families.draw(family, rng, size)
+        for family, size in groups:
+            visits = len(means.get(family, []))
+            if family == "buildings" and floors is not None and visits % _AGAIN:
+                batch = random_buildings.again(rng, floors)
+            else:
+                batch = placement_families.draw(family, rng, size)
+                floors = batch if family == "buildings" else floors
             loss, mean = loss_of(network, batch, blur, entropy, generator)
             (loss / len(groups)).backward()
             means.setdefault(family, []).append(mean)

@@ -12,7 +12,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import cube
-from rbl_gym.placement.tokens import KINDS, Scenery
+from rbl_gym.placement.tokens import KINDS, Scenery, turned
 from rbl_gym.studies.learning.random_problems import (
     Batch,
     body_and_noise,
@@ -64,6 +64,14 @@ def buildings(rng: np.random.Generator, size: int) -> Batch:
         none + 1,
         np.take_along_axis(found.views, found.fixed[:, None], axis=2),
     )
+
+
+def again(rng: np.random.Generator, batch: Batch) -> Batch:
+    """One of the mirror images of the same buildings, with other bodies, noise and numbers."""
+    seen = turned(batch.seen, int(rng.integers(8)))
+    tags, noise = body_and_noise(rng, len(seen.extent), seen.extent)
+    count = draw_count(rng, seen.fixed.shape[1])
+    return batch._replace(seen=seen._replace(tags=tags, noise=noise), count=count)
 
 
 class _Building(NamedTuple):

@@ -1,0 +1,184 @@
+"""Swaps of one anchor of a layout for a candidate, one evaluation of the score each.
+
+The evaluation gives, for each anchor left out, the derivative of the score by the information of
+each candidate. The pair of anchor and candidate with the best estimate from it is tried next.
+Problems may have leading axes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds
+from rbl_gym.bounds.information import link_information
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.placement.problem import weighted_square
+from rbl_gym.placement.tokens import Scenery
+
+__all__ = ["Poses", "State", "better", "bound_of", "judged", "standing", "swapped"]
+
+# Information without any anchor.
+_NONE = np.zeros((6, 6))
+# Upper half of a 6 x 6 matrix, and the multiplicity of its entries in a product.
+_ROWS, _COLUMNS = np.triu_indices(6)
+_TIMES = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+
+
+class Poses(NamedTuple):
+    """Poses of the score, at `Scenery.places`.
+
+    Attributes
+    ----------
+    rotation, weight
+        Rotations (P, 3, 3) and weights (P,).
+    prior
+        Information (P, 6, 6) without any anchor.
+    fixed_share
+        Information fractions (..., P, F) of the links of fixed anchors.
+    law
+        Numbers (4,) of the noise law, as `ranging.numbers_of` gives them.
+    """
+
+    rotation: FloatArray
+    weight: FloatArray
+    prior: FloatArray
+    fixed_share: FloatArray
+    law: FloatArray
+
+
+class Bound(NamedTuple):
+    """What gives the score of a layout.
+
+    Attributes
+    ----------
+    seen, poses
+        The problem.
+    prior
+        Information (..., P, 6, 6) with that of fixed anchors.
+    spread
+        Mean of ``J_n^T J_n`` (P, 6, 6).
+    told
+        Upper halves of the information of each candidate alone, (..., P, 21, C).
+    """
+
+    seen: Scenery
+    poses: Poses
+    prior: FloatArray
+    spread: FloatArray
+    told: FloatArray
+
+
+class State(NamedTuple):
+    """Layouts with their scores.
+
+    Attributes
+    ----------
+    points
+        Anchors (..., M, 3).
+    score
+        Scores (...).
+    promise
+        Estimates (..., M, C) of the decrease of the log of the squared score, if an anchor moves
+        to a candidate.
+    """
+
+    points: FloatArray
+    score: FloatArray
+    promise: FloatArray
+
+
+def bound_of(seen: Scenery, poses: Poses) -> Bound:
+    """Return what gives the score of a problem."""
+    J = bounds.tag_jacobian(poses.rotation, seen.tags)
+    spread = np.einsum("pnia,pnib->pab", J, J) / len(seen.tags)
+    bound = Bound(seen, poses, poses.prior, spread, _NONE)
+    prior = poses.prior + _told(bound, seen.fixed, poses.fixed_share).sum(axis=-4)
+    told = _packed(_told(bound, seen.candidates, seen.seen)).astype(np.float32)
+    return bound._replace(prior=prior, told=np.moveaxis(told, -3, -1).copy())
+
+
+def judged(bound: Bound, points: FloatArray, share: FloatArray) -> State:
+    """Return the state of layouts (..., M, 3), given information fractions (..., P, M)."""
+    told = _told(bound, points, share)
+    total = told.sum(axis=-4) + bound.prior
+    score = np.sqrt(_square(bound, total))
+    if not bound.told.shape[-1]:
+        return State(points, score, np.zeros((*points.shape[:-1], 0)))
+    P = np.linalg.inv(total[..., None, :, :, :] - told)
+    K = P @ bound.spread @ P
+    squares = np.einsum("...ab,...ba->...", P, bound.spread)
+    # Of each pose, b^2 falls from s to s / (1 + g) with the information, where g s is the
+    # derivative: exactly so if one direction dominates. The estimate for the anchor itself is of
+    # the same kind.
+    by = (_TIMES * _packed(K) / squares[..., None]).astype(np.float32)
+    gain = np.maximum(np.swapaxes(by, -2, -3) @ bound.told, 0.0)
+    weighted = bound.poses.weight * squares
+    left = np.einsum("...mp,...pmc->...mc", weighted, 1 / (1 + gain))
+    gain = np.maximum(np.einsum("...a,...a->...", by, _packed(told)), 0.0)
+    own = (weighted / (1 + gain)).sum(axis=-1, keepdims=True)
+    return State(points, score, np.log(own / left))
+
+
+def standing(points: FloatArray, candidates: FloatArray) -> BoolArray:
+    """Return the pairs (..., M, C) of which the candidate has an anchor already."""
+    there = (points[..., :, None, :] == candidates[..., None, :, :]).all(axis=-1)
+    return np.broadcast_to(there.any(axis=-2, keepdims=True), there.shape)
+
+
+def swapped(state: State, candidates: FloatArray, tried: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Return layouts after the most promising swap, and which pair (..., M, C) it is.
+
+    Parameters
+    ----------
+    state
+        The layouts before.
+    candidates
+        (..., C, 3).
+    tried
+        Pairs (..., M, C) that are not tried.
+    """
+    promise = np.where(tried, -np.inf, state.promise)
+    flat = promise.reshape(*promise.shape[:-2], -1)
+    pair = (np.arange(flat.shape[-1]) == flat.argmax(axis=-1)[..., None]).reshape(promise.shape)
+    moved = pair.any(axis=-1)[..., None]
+    return np.where(moved, pair.astype(float) @ candidates, state.points), pair
+
+
+def better(old: State, new: State) -> tuple[State, BoolArray]:
+    """Return the better of two states for each problem, and where it is the new one."""
+    is_new = np.asarray(new.score < old.score)
+    fields = (
+        np.where(np.expand_dims(is_new, tuple(range(is_new.ndim, x.ndim))), x, y)
+        for x, y in zip(map(np.asarray, new), map(np.asarray, old), strict=True)
+    )
+    return State(*fields), is_new
+
+
+def _square(bound: Bound, information: FloatArray) -> FloatArray:
+    poses = bound.poses
+    return weighted_square(information, poses.rotation, bound.seen.tags, poses.weight)
+
+
+def _told(bound: Bound, anchors: FloatArray, share: FloatArray) -> FloatArray:
+    """Return the information (..., M, P, 6, 6) of each anchor alone."""
+    places, tags = bound.seen.places[..., None, :, :], bound.seen.tags
+    if not anchors.shape[-2]:
+        return np.zeros((*anchors.shape[:-1], places.shape[-2], 6, 6))
+    links = np.swapaxes(share, -1, -2)[..., None, None]
+    links = np.broadcast_to(links, (*links.shape[:-1], len(tags)))
+    return link_information(
+        _NONE,
+        anchors[..., None, None, :],
+        tags,
+        bound.poses.rotation,
+        places,
+        bound.poses.law,
+        links,
+    )
+
+
+def _packed(matrices: FloatArray) -> FloatArray:
+    """Return the upper halves (..., 21) of matrices (..., 6, 6)."""
+    return matrices[..., _ROWS, _COLUMNS]
