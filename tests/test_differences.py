@@ -126,7 +126,7 @@ def test_pseudo_ranges_of_any_sign_are_read(tmp_path, offset):
         (7, 1, "9", "unknown anchor"),
         (7, 2, "9", "unknown anchor"),
         (7, 3, "9", "unknown tag"),
-        (7, 2, "3", "two anchors"),
+        (7, 2, "3", "must be another anchor than anchor_a"),
         (7, 0, "nan", "t.*finite"),
         (7, 0, "-5", "time must not fall"),
     ],

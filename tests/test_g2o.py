@@ -120,7 +120,7 @@ EDGE_SE2 0 1 1 0 0.5 1 0 0 1 0 1
         ("EDGE_SE2 0 1 1 1 1 1 0 nan 1 0 1\n", "a.g2o", "column 'I13': must be a finite number"),
         ("EDGE_SE2 0 1 2\n", "a.g2o", "line 1: must have 11 values, got 3"),
         ("EDGE_SE2 0 1 1 1 1 -1 0 0 1 0 1\n", "a.g2o", "column 'I11': must not be negative"),
-        ("VERTEX_SE2 0 1 1 1\n", "a.g2o", "must have an edge, got none"),
+        ("VERTEX_SE2 0 1 1 1\n", "a.g2o", "must have an edge, got no EDGE_SE2"),
     ],
 )
 def test_what_is_wrong_is_named(written, text, name, message):

@@ -526,8 +526,8 @@ def test_a_recording_has_a_page_without_colours(tmp_path, recording, short):
     pytest.importorskip("plotly", reason="needs the extra viz")
     path = tmp_path / "page.html"
     for names, words in (
-        (f"{recording}", "a recording of"),
-        (f"{short},{recording}", "6 trials or a recording of"),
+        (f"{recording}", "a recording in each row"),
+        (f"{short},{recording}", "6 trials or a recording in each row"),
     ):
         status, _ = bench(tmp_path, "--scenes", names, "--filters", "iekf,kf", "--fresh",
                           "--conditions", "nominal", "--html", path)  # fmt: skip

@@ -82,7 +82,7 @@ def test_columns_are_mapped_and_others_are_named_once(tmp_path):
 def test_a_column_that_is_mapped_and_not_there(tmp_path):
     with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'to' for anchor"):
         read_as(tmp_path, LONG, columns={"anchor": "to"})
-    with pytest.raises(ValueError, match=r"missing column 't', .* say .*, --columns t=NAME$"):
+    with pytest.raises(ValueError, match=r"missing column 't', .* by columns, --columns t=NAME$"):
         read(tmp_path, LONG.replace("t,", "when,", 1))
     message = r"anchors.csv, line 1: missing column 'x', 'y', 'z', got .* "
     names = "anchors.x=NAME,anchors.y=NAME,anchors.z=NAME"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import bounds, estimators, motion
-from rbl_gym.app import bench_command
+from rbl_gym.app import terminal
 from rbl_gym.bounds import links as link_bounds
 from rbl_gym.geometry import bodies
 from rbl_gym.geometry.obstacles import Obstacles
@@ -210,7 +210,7 @@ def test_benchmarks():
     with pytest.raises(
         Exception, match="must be different names separated by commas, got 'kf,,iekf'"
     ):
-        bench_command._names("kf,,iekf")
+        terminal.names("kf,,iekf")
     with pytest.raises(ValueError, match="--scenes: two are named 'hall': rename a file"):
         spec_files.scene_specs(["hall", "hall"])
 

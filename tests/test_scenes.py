@@ -237,7 +237,10 @@ BOX = {"kind": "box", "low": [0, 0, 0], "high": [1, 1, 1]}
 REFUSED: list[tuple[dict[str, Any], str]] = [
     # unknown fields
     ({"speed": 3}, "scene has no field 'speed'; its fields are anchor_region, anchor_speed_m_s"),
-    ({"noise": {"floor": 1}}, "scene.noise has no field 'floor'; it has floor_m, proportional"),
+    (
+        {"noise": {"floor": 1}},
+        "scene.noise has no field 'floor'; its fields are floor_m, proportional",
+    ),
     ({"noise": {"kind": "range", "floor": 1}}, "scene.noise:"),
     ({"dt": {"value": 1}}, "scene.dt must be a value, not a dict of fields, got {'value': 1}"),
     ({"noise": 0.1}, "scene.noise must be a dict of its fields, got 0.1"),
@@ -282,7 +285,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"start_translation": "origin"}, "start_translation must be an array of real numbers"),
     ({"start_rotation": np.diag([1, 1, -1]).tolist()}, "start_rotation must be a proper rotation"),
     ({"start_rotation": [np.eye(3).tolist()] * 2}, "start_rotation must have no leading axes"),
-    ({"noise": {"reference_tag": 6}}, "reference_tag must be below 6 tags, got 6"),
+    ({"noise": {"reference_tag": 6}}, "reference_tag must be below the number of tags, 6, got 6"),
 ]
 
 

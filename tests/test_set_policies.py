@@ -246,7 +246,7 @@ def test_scalar_worlds_are_played_as_in_the_vector_environment(kind, task):
             own[i] = env.step(action.astype(np.float32))[0]
         seen = envs.step(actions)[0]
     other = rl_task("auv_buoys").make(1)
-    with pytest.raises(ValueError, match="plays RBL"):
+    with pytest.raises(ValueError, match="does not fit"):
         policies.check_fit(policy, "mine", other)
 
 

@@ -267,7 +267,7 @@ def test_what_is_skipped_is_not_checked_and_must_exist():
 
 
 def test_a_factory_that_takes_no_laws_is_told_so():
-    with pytest.raises(AssertionError, match=r"make_filter\(tags=, noise=, process=\) must take"):
+    with pytest.raises(AssertionError, match=r"make_filter\(tags=, noise=, process=\) must accept"):
         check_filter(lambda tags: None)
 
 

@@ -249,7 +249,7 @@ class KalmanFamily:
                 return None
         else:
             weights = weigh_plain(state.covariance, ranges, law, anchors, VAGUE_ENTRY_VARIANCE)
-            if not all_finite(weights):
+            if not (all_finite(weights) and all_finite(anchors)):
                 return None
             epoch = LinearEpoch(ranges, anchors, self.tags, weights)
             mean, covariance = FilterPy.update(*plain(state)[:2], epoch)

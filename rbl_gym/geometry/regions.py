@@ -1,8 +1,7 @@
 """Define regions of allowed anchor positions: boxes, walls and ceiling of a room, shells.
 
-A region draws points from uniforms, and projects any point onto itself; arrays (..., 3). Its
-faces give the wall of a point, with orientation and name. `geometry.mounts` holds regions of any
-shape.
+A region draws points from uniforms, and projects any point onto itself; arrays (..., 3). Its faces
+give the wall of a point, with orientation and name. `geometry.mounts` has regions of any shape.
 """
 
 from __future__ import annotations
@@ -32,10 +31,8 @@ class Faces(NamedTuple):
     ----------
     origin
         (K, 3), a corner of each box, metres.
-    axes
-        (K, 3, 3): the directions of its sides from this corner, rows of unit length.
-    extents
-        (K, 3): the lengths of its sides, metres; 0 if it is flat.
+    axes, extents
+        (K, 3, 3), unit directions of its sides in rows; (K, 3), their lengths, metres, 0 if flat.
     normal
         (K, 3): direction that anchors on it face, of unit length; zero: all directions.
     cost
@@ -243,8 +240,8 @@ class Walls(Faced):
         for axis, value, name in zip(*_faces(low, high), names, strict=True):
             flat = np.arange(3) != axis
             sign = 1.0 if value == low[axis] else -1.0
-            origin = np.where(flat, low, value)
-            rows.append((origin, np.eye(3), flat * (high - low), sign * ~flat, name))
+            corner, extents = np.where(flat, low, value), flat * (high - low)
+            rows.append((corner, np.eye(3), extents, sign * ~flat, name))
         return Faces.of(rows)
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
@@ -259,8 +256,7 @@ class Walls(Faced):
         # x walls run along y, y walls and the ceiling along x; the ceiling's "up" is y.
         inside = np.stack([along, np.where(face < 2, along, up), up], axis=-1)
         points = low + inside * (high - low)
-        axes, values = _faces(low, high)
-        face = face[..., None]
+        (axes, values), face = _faces(low, high), face[..., None]
         return np.where(axes[face] == np.arange(3), values[face], points)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -270,8 +266,8 @@ class Walls(Faced):
     def place(self, action: FloatArray) -> FloatArray:
         """Return the point where the ray from the room centre along the action meets a surface.
 
-        The surface is a wall or the ceiling. A ray that points down ends at the height of the
-        floor; one to the floor itself goes to the nearest legal point.
+        A ray that points down ends at the height of the floor; one to the floor, at the nearest
+        legal point.
         """
         return place_on_walls(action, *self._corners)
 
@@ -294,7 +290,7 @@ def _project_to_box(points: FloatArray, low: FloatArray, high: FloatArray) -> Fl
 
 @compiled("walls:place_in_box")
 def _place_in_box(action: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
-    """Compute `Box.place` in boxes of this centre and half size (..., 3)."""
+    """Compute `Box.place`; centres and half sizes (..., 3)."""
     return middle + _cut(action) * half
 
 
@@ -307,8 +303,7 @@ def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> 
     # Squared distance to each surface. Below the floor, the smallest gap alone is misleading.
     squares = outside.sum(axis=-1)[..., None] - outside[..., axes]
     face = (squares + (points[..., axes] - values) ** 2).argmin(axis=-1)[..., None]
-    values = np.broadcast_to(values, squares.shape)
-    chosen = np.take_along_axis(values, face, axis=-1)
+    chosen = np.take_along_axis(np.broadcast_to(values, squares.shape), face, axis=-1)
     return np.where(axes[face] == np.arange(3), chosen, inside)
 
 
@@ -319,8 +314,8 @@ def place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> Flo
     middle, half = _middle(low, high)
     reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
     points = middle + _cut(action / np.maximum(reach, 1e-3)[..., None]) * half
-    nowhere = reach[..., None] < 1e-3
-    return np.where(nowhere, _project_on_walls.textbook(points, low, high), points)
+    projected = _project_on_walls.textbook(points, low, high)
+    return np.where(reach[..., None] < 1e-3, projected, points)
 
 
 @dataclass(frozen=True)
@@ -361,18 +356,16 @@ class Shell(Faced):
         """Return points with clipped radius; the origin goes to the inner sphere along x."""
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
         legal = np.clip(radius, self.inner_m, self.outer_m)
-        outward = points * (legal / np.where(radius > 0, radius, 1.0))
-        return np.where(radius > 0, outward, self.inner_m * np.eye(3)[0])
+        scaled = points * (legal / np.where(radius > 0, radius, 1.0))
+        return np.where(radius > 0, scaled, self.inner_m * np.eye(3)[0])
 
     def place(self, action: FloatArray) -> FloatArray:
         """Return points in the direction of actions (x for zero); their length sets the radius."""
         action = _cut(action)
         length = np.linalg.norm(action, axis=-1, keepdims=True)
-        # The squares of shorter ones underflow, and the direction is lost.
-        far = length > 1e-150
+        far = length > 1e-150  # The squares of shorter ones underflow.
         direction = np.where(far, action / np.where(far, length, 1), np.eye(3)[0])
-        radius = self.inner_m + (self.outer_m - self.inner_m) * np.minimum(length, 1.0)
-        return radius * direction
+        return (self.inner_m + (self.outer_m - self.inner_m) * np.minimum(length, 1.0)) * direction
 
     def action(self, points: FloatArray) -> FloatArray:
         """Return the inverse of `place`; a point on the inner sphere gives a tiny action."""
@@ -397,11 +390,11 @@ def _cut(action: FloatArray) -> FloatArray:
 
 
 def _middle(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return centre and half size of a box: [-1, 1]^3 scales to it."""
+    """Return centre and half size of a box."""
     return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _unscaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return points in units of the half size of a box, zero along an axis without extent."""
+    """Return points in units of the half size of a box; zero along an axis without extent."""
     middle, half = _middle(low, high)
     return np.where(half > 0, (points - middle) / np.where(half > 0, half, 1.0), 0.0)

@@ -1,8 +1,7 @@
 """Model the motion of a rigid body: kinematics of the tracking paper, noise, trajectories.
 
 A twist (..., 6) is the angular velocity in the world frame [rad/s] and the velocity [m/s].
-Kinematics (tracking paper, (10)-(15), where Omega includes the time step tau): ``Q_k = exp(omega
-tau) Q_{k-1}``, ``t_k = t_{k-1} + v tau``.
+Kinematics (tracking paper, (10)-(15)): ``Q_k = exp(omega tau) Q_{k-1}``, ``t_k = t_{k-1} + v tau``.
 """
 
 from __future__ import annotations

@@ -86,9 +86,14 @@ def transfer_task(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Return `transfer_loops` of a task with a filter in the loop, otherwise `transfer_layouts`.
+    """Run `transfer_loops` for a task with a filter in the loop, otherwise `transfer_layouts`.
 
-    Only layouts have `repeats`.
+    Parameters
+    ----------
+    task, policies, names, worlds, seed, advance
+        As in these functions.
+    repeats
+        Bodies in each world; for layouts only.
     """
     if task.env_id in _OWN_SCENES:
         return transfer_loops(task, policies, names, worlds, seed, advance)
