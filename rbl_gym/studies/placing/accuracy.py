@@ -20,19 +20,19 @@ __all__ = [
     "level_maps",
 ]
 
-# Turns of the body over which the accuracy at a place is averaged.
+# Number of rotations of the body over which the accuracy at a position is averaged.
 TURNS = 9
-# Places along the axes where the worst is sought, edges included.
+# Grid of positions along the axes for the search of the worst one; edges are included.
 _GRID = (9, 9, 3)
-# Places along the longer side of a map, and at least along the other.
+# Number of cells along the longer side of a map, and minimum along the shorter one.
 _MAP, _LEAST_MAP = 56, 20
-# Heights at which a map is drawn in 3-D.
+# Number of heights at which a map is drawn in 3-D.
 _LEVELS = 5
-# Links that are worked on at a time, so that the temporaries stay in cache.
+# Number of links that are processed at a time, so that the temporaries stay in cache.
 _BLOCK = 40_000
-# Rotation of the prior that regularises the bound, and information where the tilt is known.
+# Rotation std of the prior that regularises the bound, and information of a known tilt.
 _PRIOR_ROTATION_RAD, _KNOWN = math.radians(60), 1e12
-# Drawings of a zone's bounding box after which it has no free place.
+# Maximum number of draws from a zone's bounding box, and positions per draw.
 _DRAWS, _DRAWN = 200, 4096
 
 
@@ -42,9 +42,9 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zo
     Parameters
     ----------
     problem, anchors
-        The problem, and the anchors (M, 3).
+        The placement problem, and the anchor positions (M, 3).
     places, zone
-        The positions, and the zone with the possible rotations.
+        The positions, and the zone, which defines the possible rotations.
     """
     rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
     found = []
@@ -57,7 +57,7 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zo
 def accuracy_without_each(
     problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zone
 ) -> Errors:
-    """Return `accuracy` (M, L) without each one of the anchors. Arguments as in `accuracy`."""
+    """Return `accuracy` (M, L) without each of the anchors. Arguments as in `accuracy`."""
     rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
     found = []
     for part in _blocks(problem, anchors, places):
@@ -72,9 +72,10 @@ def _blocks(problem: Problem, anchors: FloatArray, places: FloatArray) -> list[F
 
 
 def prior_of(problem: Problem, zone: Zone) -> FloatArray:
-    """Return the prior information (6, 6): 60 degrees, and half of the extent of all zones.
+    """Return the prior information (6, 6) of a pose.
 
-    If only the heading is estimated, the tilt is known.
+    Its standard deviations are 60 degrees, and half of the extent of all zones. If only the heading
+    is estimated, the tilt is known.
     """
     extent = float(np.ptp(problem.corners(), axis=0).max())
     diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
@@ -109,12 +110,12 @@ def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: i
 
 
 def is_free(problem: Problem, zone: Zone, places: FloatArray) -> BoolArray:
-    """Return which positions (...) lie in a zone, including edges, and in no obstacle."""
+    """Return which positions (...) lie in a zone or on its edges, and outside obstacles."""
     return zone.contains(places) & ~problem.obstacles.contain(places)
 
 
 def free_grid(problem: Problem, zone: Zone) -> FloatArray:
-    """Return a grid of positions (L, 3) over a zone with edges and corners, without obstacles."""
+    """Return a grid of free positions (L, 3) over a zone, including its edges and corners."""
     low, high = zone.bounds()
     axes = [np.linspace(a, b, n if b > a else 1) for a, b, n in zip(low, high, _GRID, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -124,11 +125,12 @@ def free_grid(problem: Problem, zone: Zone) -> FloatArray:
 
 
 class Map(NamedTuple):
-    """Accuracy on a plane: edges of its axes, values (rows, columns), NaN: off the zone or blocked.
+    """Accuracy on a plane: edges of the cells, and values (rows, columns).
 
-    `across` and `up` are the axes (0, 1, 2) of columns and rows, `at` the third coordinate.
-    Position and rotation are of all three axes together; `horizontal`, `height` (m) and
-    `heading` (degrees) are what zones ask for.
+    Values are NaN outside the zone and inside obstacles. `across` and `up` are the axes (0, 1, 2)
+    of columns and rows, `at` is the coordinate on the third axis. Position and rotation are errors
+    over all three axes; `horizontal`, `height` (m) and `heading` (degrees) are the errors that
+    zones limit.
     """
 
     columns: FloatArray
@@ -155,13 +157,13 @@ def accuracy_map(
     Parameters
     ----------
     problem, anchors
-        The problem, and the anchors (M, 3).
+        The placement problem, and the anchor positions (M, 3).
     up
-        1: over x and y; 2: over x and z.
+        Vertical axis of the map: 1 for a map over x and y; 2 for x and z.
     share
         Position of the plane on the third axis: 0 is the lower side of the zone, 1 the upper one.
     zone
-        None: the first.
+        The zone; None: the first one.
     """
     zone = problem.zones[0] if zone is None else zone
     low, high = zone.bounds()

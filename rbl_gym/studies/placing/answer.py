@@ -33,9 +33,9 @@ from rbl_gym.studies.progress import Advance, silent
 
 __all__ = ["Placed", "Question", "place_anchors"]
 
-# Poses over which the criteria of the result are averaged.
+# Number of poses over which the criteria of the result are averaged.
 _MANY_POSES = 1000
-# A link that keeps this share of its information counts as seen.
+# A link counts as seen if it keeps at least this share of its information.
 _SEEN = 0.5
 
 
@@ -51,7 +51,7 @@ class Question:
     fewest
         Find the smallest number that meets the requirements of all zones.
     layout, names
-        Anchors (M, 3) to evaluate, and their names; None: they are designed.
+        Anchor positions (M, 3) to evaluate, and their names; None: the anchors are designed.
     optimise
         Use the layout as the start of a design, instead of evaluating it.
     keep
@@ -78,7 +78,7 @@ class Question:
 
 
 class Placed(NamedTuple):
-    """The result of a run: the problem with its last number of anchors, the design, the figures."""
+    """Result of a run: the problem with its last number of anchors, the design, the figures."""
 
     problem: Problem
     design: Design
@@ -86,7 +86,7 @@ class Placed(NamedTuple):
 
 
 def place_anchors(problem: Problem, question: Question, advance: Advance = silent) -> Placed:
-    """Design or take a layout, evaluate, compare and check it; figures are plain numbers.
+    """Design or read a layout, then evaluate, compare and check it; figures are plain numbers.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def place_anchors(problem: Problem, question: Question, advance: Advance = silen
 
 
 def _with_kept(problem: Problem, question: Question) -> tuple[Problem, FloatArray | None]:
-    """The problem with the kept anchors among its fixed ones, and the layout to start from."""
+    """Return the problem with the kept anchors as fixed ones, and the start layout."""
     layout = question.layout
     if layout is None:
         if question.keep or question.optimise:
@@ -170,7 +170,10 @@ def _is_in(place: FloatArray, places: FloatArray) -> bool:
 def _designed(
     problem: Problem, question: Question, start: FloatArray | None, advance: Advance
 ) -> Design:
-    """The best layout for b; where it misses a requirement, or one may fail, exchanges from it."""
+    """Return the design with the smallest b.
+
+    If it misses a requirement, or any one anchor may fail, it is improved by exchanges.
+    """
     seed, survive = question.seed, question.survive
     advance(0, more=design.SEARCH_STEPS)
     found = design.design_layout(problem, seed, advance, start, question.start)
@@ -192,7 +195,7 @@ def _designed(
 def _result(
     problem: Problem, question: Question, found: Design, judged: list[Judged]
 ) -> dict[str, Any]:
-    """All figures of one layout."""
+    """Return all figures of a layout."""
     seed, survive, anchors = question.seed, question.survive, found.anchors
     low, high = problem.corners()
     edges = [at_edges(problem, anchors, one) for one in judged]
@@ -221,7 +224,7 @@ def _result(
 
 
 def verdict(judged: list[Judged]) -> str:
-    """The worst of the zones' verdicts; those that ask for nothing do not count."""
+    """Return the worst verdict of the zones; zones without a requirement do not count."""
     found = {one.verdict for one in judged}
     for name in ("fail", "undecided", "pass"):
         if name in found:
@@ -246,7 +249,7 @@ def _obstacles(problem: Problem) -> list[dict[str, Any]]:
 def _anchors(
     problem: Problem, question: Question, anchors: FloatArray, judged: list[Judged]
 ) -> list[dict[str, Any]]:
-    """A row of each anchor: where it is, what it sees, what is left without it."""
+    """Return a row for each anchor: its position, the share it sees, the accuracy without it."""
     first = [one.first()._replace(without=None) for one in judged]
     lost = [accuracy_without_each(problem, anchors, one.places, one.zone) for one in first]
     seen = np.concatenate([problem.share(anchors, one.places) >= _SEEN for one in first])
@@ -286,7 +289,7 @@ def _anchors(
 def _next(
     problem: Problem, anchors: FloatArray, judged: list[Judged], seed: int, survive: int
 ) -> dict[str, Any] | None:
-    """Where one more anchor helps most, and what it buys."""
+    """Return the best position of one more anchor, and the accuracy with it."""
     found = choosing.next_anchor(problem, anchors, seed, survive)
     if found is None:
         return None
@@ -309,7 +312,7 @@ def _overall(judged: list[Judged]) -> float:
 
 
 def _fewest_row(least: Fewest) -> dict[str, Any]:
-    """The answer to the least number: whether it is met, the margin, what one less would give."""
+    """Return the row of the smallest number: met or not, the margin, the result with one less."""
     row: dict[str, Any] = {
         "met": least.met,
         "n_anchors": len(least.anchors),
@@ -327,7 +330,7 @@ def _fewest_row(least: Fewest) -> dict[str, Any]:
 
 
 def _summary(problem: Problem, anchors: FloatArray, judged: list[Judged]) -> dict[str, Any]:
-    """A layout's row in a table of layouts."""
+    """Return the row of a layout in a table of layouts."""
     found = overview(judged, [at_edges(problem, anchors, one) for one in judged])
     row: dict[str, Any] = {"score_m": found["score_m"]["rms"]}
     for name in ("position_m", "rotation_deg"):
@@ -341,7 +344,7 @@ def _summary(problem: Problem, anchors: FloatArray, judged: list[Judged]) -> dic
 def _comparison(
     problem: Problem, found: Design, seed: int, survive: int
 ) -> dict[str, dict[str, Any]]:
-    """The design and the usual layouts, each a row of figures."""
+    """Return the figures of the design and of the usual layouts, one row each."""
     rows = {"given" if found.method == "given" else "designed": found.anchors}
     rows |= design.usual_layouts(problem, seed)
     table = {
@@ -356,7 +359,7 @@ def _comparison(
 
 
 def _criteria(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
-    """The criteria as numbers; None where there is none (conditioning of coplanar anchors)."""
+    """Return the criteria as numbers; None if undefined (conditioning of coplanar anchors)."""
     task = design.free_task(scene_files.with_anchors(problem, len(anchors)), _MANY_POSES)
     values = criteria.criteria(task, problem.context, anchors)._asdict()
     numbers = {name: float(value) for name, value in values.items()}
@@ -366,6 +369,6 @@ def _criteria(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
 
 
 def _is_flat(anchors: FloatArray) -> bool:
-    """Whether the anchors lie in one plane, as three always do."""
+    """Return whether the anchors lie in one plane, as three always do."""
     spread = np.linalg.svd(anchors - anchors.mean(axis=0), compute_uv=False)
     return bool(len(anchors) < 4 or spread[2] < 1e-6 * spread[0])

@@ -24,17 +24,18 @@ __all__ = [
     "draw_bodies",
 ]
 
-# A consistent belief is this far from the truth once in a million: such a pose is lost, for
+# A pose is lost if a consistent belief would be this far from the truth once in a million, for
 # instance the mirror image behind a plane of anchors.
 _LOST_NEES = float(special.chdtri(6, 1e-6))
-# A range below this, metres, is no reading.
+# Ranges below this value (metres) do not count as measured.
 _LEAST_RANGE_M = 1e-3
-# Standard deviation of a tilt that is known, radians.
+# Standard deviation of a known tilt, radians.
 _KNOWN_RAD = 1e-6
-# The prediction holds where the errors of all bodies are at most so many times the predicted
-# ones, and three standard deviations of such a ratio; and where so few are without a pose.
+# The prediction holds if the ratio of actual to predicted errors of all bodies is at most the first
+# value, plus three standard deviations of such a ratio, and the share of bodies without a pose is
+# at most the second.
 _RATIO, _WITHOUT_POSE = 1.1, 0.01
-# Errors that are drawn from each body's bound, for the share that is predicted to be within.
+# Number of errors drawn from the bound of each body, for the predicted share within the limits.
 _DRAWS = 40
 
 
@@ -46,11 +47,11 @@ class DrawnBodies(NamedTuple):
     zone
         Index (B,) of the zone of each body.
     rotation, translation
-        The truth.
+        The true rotation (B, 3, 3) and translation (B, 3).
     ranges, links, told
-        Ranges, the mask of measured ones, and the noise law of every link.
+        Ranges, the mask of measured ones, and the noise law of each link.
     prior_rotation, prior_translation, prior
-        Drawn around the truth, with the covariance (B, 6, 6).
+        Prior poses, drawn around the truth, and their covariance (B, 6, 6).
     information
         Fisher information (B, 6, 6) of the ranges at the truth.
     """
@@ -68,7 +69,7 @@ class DrawnBodies(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Poses (B, ...) found by a filter, NaN if none, and the covariance (B, 6, 6)."""
+    """Poses (B, ...) found by a filter, NaN if none, and their covariance (B, 6, 6)."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -78,21 +79,21 @@ class Found(NamedTuple):
 def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[str, Any]:
     """Compare the errors of filters with the prediction of the bound for the same poses.
 
-    - ``iterated EKF``: one update from a prior drawn around the truth; it knows which links
-    are blocked, as reported by radios.
-    - ``iterated EKF, not told``: treats all links as clear, with Huber's loss; only with
-    obstacles or a limited gain.
-    - ``locate, from nothing``: maximum likelihood without a prior; it also knows blocked links.
-    Only if the ranges determine the pose of nine bodies in ten, and no zone has a known tilt.
+    - ``iterated EKF``: one update from a prior drawn around the truth. It knows which links are
+      blocked, as radios report it.
+    - ``iterated EKF, not told``: treats all links as clear, with Huber's loss. Only with obstacles
+      or a limited gain.
+    - ``locate, from nothing``: maximum likelihood without a prior. It also knows the blocked links.
+      Only if the ranges determine the pose of nine bodies in ten, and no zone has a known tilt.
 
     The figures include all bodies with a pose, found or lost; see `_figures`.
 
     Parameters
     ----------
     problem, anchors
-        The problem, and the anchors (M, 3).
+        The placement problem, and the anchor positions (M, 3).
     trials, seed
-        Number of bodies at random poses, equally many in each zone, and the random seed.
+        Number of bodies at random poses, the same in each zone, and the random seed.
     """
     drawn = draw_bodies(problem, anchors, trials, np.random.default_rng([seed, 1]))
     with_prior = np.linalg.inv(drawn.information + np.linalg.inv(drawn.prior))
@@ -126,7 +127,7 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
 def _located(
     problem: Problem, anchors: FloatArray, drawn: DrawnBodies, enough: np.ndarray
 ) -> Found:
-    """What maximum likelihood finds of the bodies whose ranges tell a pose; NaN of the others."""
+    """Locate the bodies whose ranges determine a pose by maximum likelihood; others are NaN."""
     found = estimators.locate(
         drawn.ranges[enough],
         anchors,
@@ -144,12 +145,14 @@ def _located(
 def draw_bodies(
     problem: Problem, anchors: FloatArray, trials: int, rng: np.random.Generator
 ) -> DrawnBodies:
-    """Draw bodies uniformly over the free part of each zone, with random rotation, and one epoch.
+    """Draw bodies at random poses, with one epoch of ranges.
+
+    Positions are uniform over the free part of each zone, rotations are random.
 
     Parameters
     ----------
     problem, anchors
-        The problem, and the anchors (M, 3).
+        The placement problem, and the anchor positions (M, 3).
     trials, rng
         Number of bodies, and the source of randomness.
     """
@@ -168,7 +171,7 @@ def draw_bodies(
     weight = link_shares(problem, anchors, translation, rotation[:, None])[:, 0]
     distance = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
     normals = rng.standard_normal(distance.shape)
-    # A link with nothing left of its information gives no reading.
+    # A link without information gives no range.
     scale = np.where(weight > 0, 1 / np.sqrt(np.maximum(weight, 1e-300)), 0.0)
     ranges = problem.noise.sample(distance, scale * normals)
     links = (weight > 0) & (ranges > _LEAST_RANGE_M)
@@ -195,20 +198,23 @@ def draw_bodies(
 def _figures(
     problem: Problem, drawn: DrawnBodies, found: Found, bound: FloatArray, seed: int
 ) -> dict[str, Any]:
-    """Real errors beside the predicted ones: of all bodies, of those found, and of every zone.
+    """Return actual and predicted errors, over all bodies and by zone.
 
-    Keys: ``found``, the share of bodies with a pose no further off than once in a million;
-    ``without_pose``, the share that has none; of all that have one ``position_rmse_m``,
-    ``position_p95_m`` (of every body, None where more than that have no pose),
-    ``position_predicted_m``, ``position_ratio``, the same of ``rotation`` in degrees, and
-    ``nees``; keys with ``_found`` are of those found. ``holds``: whether the errors of all are as
-    predicted. ``zones``: of each zone, in its own terms; ``within`` is the share of its bodies
-    whose errors are within the limits, ``within_predicted`` what the bound says of it.
+    - ``found``: share of the bodies whose pose is not lost (see `_LOST_NEES`).
+    - ``without_pose``: share of the bodies without a pose.
+    - ``position_rmse_m``, ``position_predicted_m``, ``position_ratio``: over all bodies with a
+      pose.
+    - ``position_p95_m``: over all bodies; None if more than 5 % have no pose.
+    - the same keys of ``rotation``, in degrees, and ``nees``. Keys with ``_found`` are over the
+      bodies that are found.
+    - ``holds``: whether the errors of all bodies agree with the prediction.
+    - ``zones``: rows of the zones. ``within`` is the share of the bodies of a zone whose errors are
+      within its limits, ``within_predicted`` the share predicted by the bound.
     """
     known = np.all(
         [np.isfinite(x.reshape(len(x), -1)).all(axis=1) for x in (*found, bound)], axis=0
     )
-    # The truth stands in where there is no pose.
+    # Without a pose, the truth is a placeholder.
     rotation, translation = (
         np.where(known.reshape(-1, *[1] * (truth.ndim - 1)), pose, truth)
         for pose, truth in (
@@ -221,7 +227,7 @@ def _figures(
     )
     error = metrics.pose_error(rotation, translation, drawn.rotation, drawn.translation)
     nees = metrics.nees(error, claimed)
-    # By the bound too: a filter that claims too little must not hide its errors as lost.
+    # The bound must agree: an overconfident filter must not hide its errors as lost poses.
     kept = known & ~((nees > _LOST_NEES) & (metrics.nees(error, bound) > _LOST_NEES))
     variance = np.einsum("bii->bi", bound)
     result: dict[str, Any] = {
@@ -268,7 +274,7 @@ def _zones(
     kept: np.ndarray,
     seed: int,
 ) -> list[dict[str, Any]]:
-    """A row of each zone: horizontal position and heading, and what is within the limits."""
+    """Return a row for each zone: horizontal and heading errors, share within the limits."""
     rows = []
     variance = np.einsum("bii->bi", bound)
     for k, one in enumerate(problem.zones):
@@ -297,7 +303,7 @@ def _zones(
 
 
 def _within(error: FloatArray, limits: Any) -> np.ndarray:
-    """Which pose errors (..., 6) are within the limits."""
+    """Return which pose errors (..., 6) are within the limits."""
     across = np.hypot(error[..., 3], error[..., 4]) <= limits.horizontal
     up, turn = np.abs(error[..., 5]) <= limits.height, np.abs(error[..., 2]) <= limits.heading
     return across & up & turn

@@ -27,15 +27,15 @@ from rbl_gym.studies.progress import Advance, silent
 
 __all__ = ["Fewest", "fewest_anchors", "next_anchor"]
 
-# Poses over which choices are made: places in all zones together, at least in each; turns.
+# Poses of a search: positions in all zones together, minimum in each zone, and rotations.
 _PLACES, _LEAST_PLACES, _TURNS = 400, 128, 3
-# Candidates that are drawn, and how many of a later round stand near the anchors of the last.
+# Number of candidates to draw, and the share of them near the anchors in later rounds.
 _CANDIDATES, _NEAR = 200, 0.6
-# Later rounds, and how far their near candidates are: shares of the extent of the mounts.
+# Distance of near candidates in the later rounds, as shares of the extent of the mounts.
 _REACHES = (0.05, 0.015)
-# A layout whose value is above this is not worth the later rounds.
+# A layout with a value above this is not refined in later rounds.
 _NEAR_ENOUGH = 1.06
-# All choices are tried where they are no more than so many.
+# All choices are tried if there are at most this many.
 _MOST_CHOICES = 3000
 
 
@@ -45,7 +45,7 @@ class Fewest(NamedTuple):
     Attributes
     ----------
     anchors
-        (M, 3); of the largest allowed number if it does not suffice.
+        Positions (M, 3). If no allowed number suffices, those of the largest number.
     judged
         Results of every zone; all pass if `met`.
     met
@@ -53,7 +53,8 @@ class Fewest(NamedTuple):
     one_less, judged_less
         The best layout found with one anchor less, which does not suffice; None if not allowed.
     proved
-        Whether all choices of one less were tried, which is done for a short list of mounts.
+        Whether all choices with one anchor less were tried, which is done for a short list of
+        mounts.
     """
 
     anchors: FloatArray
@@ -68,7 +69,7 @@ class Fewest(NamedTuple):
 
 
 def candidates(problem: Problem, rng: np.random.Generator, count: int = _CANDIDATES) -> FloatArray:
-    """Return up to `count` different legal mounts (K, 3); all of them if they are a list.
+    """Return up to `count` distinct legal mounts (K, 3); all of them if the mounts are a list.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ def candidates(problem: Problem, rng: np.random.Generator, count: int = _CANDIDA
 
 
 def _legal(problem: Problem, points: FloatArray) -> FloatArray:
-    """Those of the points (K, 3) that are legal mounts, to the millimetre, each once."""
+    """Return the distinct legal mounts among the points (K, 3), rounded to the millimetre."""
     points = problem.mounts.project(np.round(points, 3))
     off = np.abs(problem.mounts.project(points) - points).max(axis=-1)
     points = points[(off <= 1e-6) & ~problem.obstacles.contain(points)]
@@ -157,7 +158,7 @@ def improved(
 def _around(
     problem: Problem, rng: np.random.Generator, anchors: FloatArray, reach: float | None
 ) -> FloatArray:
-    """Candidates everywhere, most of them within a share of the mounts' extent of the anchors."""
+    """Return candidates everywhere, or mostly within a distance of the anchors."""
     if reach is None:
         return candidates(problem, rng)
     extent = float(np.ptp(problem.mounts.bounds(), axis=0).max())
@@ -173,7 +174,7 @@ def _first(anchors: FloatArray, points: FloatArray) -> FloatArray:
     return np.concatenate([anchors, points[~known]])
 
 
-# --- the least number ----------------------------------------------------------------------------
+# --- the smallest number -------------------------------------------------------------------------
 
 
 def fewest_anchors(
@@ -264,7 +265,7 @@ def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[
     path = {keep: list(range(keep))}
     for chosen, reached in grown(stock, range(keep), most, survive):
         path[len(chosen)] = chosen
-        # Far enough on for the first number that is tried.
+        # The greedy choice has passed the first number to try.
         if stock.asks and reached <= 0.8:
             break
     return path
@@ -273,7 +274,7 @@ def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[
 def _first_count(
     stock: Stock, starts: tuple[dict[int, list[int]], ...], numbers: range, survive: int
 ) -> int:
-    """The number at which the greedy choice is within the requirements, or the largest."""
+    """Return the number at which the greedy choice meets the requirements, or the largest one."""
     path = starts[0]
     for count in sorted(path):
         if count >= max(numbers[0], 1) and value(stock, path[count], survive) <= 1:
@@ -296,7 +297,7 @@ def _one_dropped(
 def _cheapened(
     problem: Problem, anchors: FloatArray, judged: list[Judged], seed: int, survive: int
 ) -> tuple[FloatArray, list[Judged]]:
-    """The layout after exchanges that save money and still meet the requirements."""
+    """Return the layout after exchanges that save cost and still meet the requirements."""
     rng = np.random.default_rng([seed, 7])
     points = _first(anchors, candidates(problem, rng))
     stock = stock_of(problem, points, seed)

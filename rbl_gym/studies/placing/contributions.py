@@ -21,7 +21,7 @@ __all__ = ["without_each"]
 
 
 def without_each(judged: list[Judged], lost: list[Errors]) -> list[dict[str, Any]]:
-    """Return for each anchor the figures without it: b over all zones, and those of every zone.
+    """Return for each anchor the figures without it: b over all zones, and those of each zone.
 
     Parameters
     ----------

@@ -24,13 +24,13 @@ __all__ = [
     "usual_layouts",
 ]
 
-# Poses over which the usual layouts are compared.
+# Number of poses over which the usual layouts are compared.
 _N_POSES = 64
-# What a design begins with: `placement.design`, or `placement.amortised` with so many steps.
+# Methods of the search: `placement.design`, or `placement.amortised` with this many steps.
 STARTS, _EVALUATIONS = ("search", "amortised"), 20
-# Usual layouts from which the search starts too, where nothing is in the way.
+# Usual layouts that are also start layouts of the search, if there are no obstacles.
 _STARTS = ("grid", "ring")
-# Random layouts whose median stands for "at random".
+# The layout "random" is the median of this many random layouts.
 _RANDOM_DRAWS = 25
 
 
@@ -47,7 +47,7 @@ class FreeTask(PlacementTask):
     def poses(self) -> tuple[FloatArray, FloatArray]:
         """Return rotations (P, 3, 3) and offsets (P, 3), spread evenly over the free space."""
         low, high = self.scene.volume.bounds()
-        # Few places may be free: they are then taken in turns.
+        # If fewer positions are free than needed, they are repeated.
         places = np.resize(self.problem.free_places(self.n_poses), (self.n_poses, 3))
         half = 0.5 * (high - low)
         offsets = (places - 0.5 * (low + high)) / np.where(half > 0, half, 1.0)
@@ -118,7 +118,7 @@ def design_layout(
         for name, anchors in searched.items()
         if not problem.obstacles.contain(anchors).any()
     }
-    # Judged over more places than those that the search has seen.
+    # Evaluated at more positions than the search has used.
     scores = {name: judging.score_of(problem, x, seed) for name, x in legal.items()}
     best = min(scores, key=scores.__getitem__)
     ordered = _in_order(legal[best][len(fixed) :], context.centre)
@@ -154,7 +154,7 @@ def usual_layouts(problem: Problem, seed: int) -> dict[str, FloatArray]:
 
 
 def usual(task: PlacementTask, context: Context, rng: np.random.Generator) -> dict[str, FloatArray]:
-    """The usual layouts; `random` is the median of many draws."""
+    """Return the usual layouts; `random` is the median of many draws."""
     found = {
         name: layout(task, context, rng)
         for name, layout in layouts.LAYOUTS.items()

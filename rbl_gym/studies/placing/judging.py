@@ -31,11 +31,11 @@ __all__ = [
     "zone_row",
 ]
 
-# Places of a zone that are drawn first, and most of them, where its share is near what it asks.
+# Number of positions drawn in a zone at first, and the maximum if the verdict is undecided.
 PLACES, MOST_PLACES = 600, 9600
 # Limits by the names of a zone's requirement.
 _KEYS = {"horizontal": "position_m", "height": "height_m", "heading": "heading_deg"}
-# Worst places that are told, and how far apart they are: a share of the zone's extent.
+# Number of worst positions to report, and their minimum distance as a share of the zone's extent.
 _WORST, _APART = 3, 0.1
 
 
@@ -45,13 +45,13 @@ class Judged(NamedTuple):
     Attributes
     ----------
     zone
-        Which one.
+        The evaluated zone.
     places
-        (L, 3), positions, uniform over its free part.
+        Positions (L, 3), uniform over the free part of the zone.
     errors
-        At each of them (L).
+        Errors (L) at the positions.
     without
-        (M, L), without each one of the anchors; None if no anchor may fail.
+        Errors (M, L) without each of the anchors; None if no anchor may fail.
     """
 
     zone: Zone
@@ -100,7 +100,7 @@ class Judged(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """``"pass"``, ``"fail"``, ``"undecided"``: by the interval; or ``"no requirement"``."""
+        """``"pass"``, ``"fail"`` or ``"undecided"`` by the interval; or ``"no requirement"``."""
         if not self.asks:
             return "no requirement"
         low, high = self.interval
@@ -164,15 +164,15 @@ def _side_by_side(one: Errors, other: Errors) -> Errors:
 
 
 def short_row(judged: Judged) -> dict[str, Any]:
-    """A zone's verdict: name, verdict, share and its interval, requirement, margin, what it needs.
+    """Return the verdict of a zone and its main figures.
 
-    Keys: ``name``, ``verdict``, ``pass`` (None: undecided or nothing asked), ``places``; of a
-    layout that must spare any one anchor ``without_anchor``, the one that is missed most, counted
-    from 1; of a zone that asks for something ``share``, ``share_low``, ``share_high``,
-    ``required``, ``margin`` (the requirement over what is reached at the required share: 1.2 is
-    20 % to spare), ``would_pass`` (what each limit would have to be, the others as they are, and
-    the ``factor`` on all of them; None: no value would do); ``rms_position_m`` (horizontal),
-    ``rms_height_m``, ``rms_heading_deg``, ``rms_score_m``.
+    - ``name``, ``verdict``, ``pass`` (None if undecided or without a requirement), ``places``.
+    - ``without_anchor``: if any one anchor may fail, the number of the critical one, from 1.
+    - With a requirement: ``share``, ``share_low``, ``share_high``, ``required``.
+    - ``margin``: the requirement over the value reached at the required share; 1.2 leaves 20 %.
+    - ``would_pass``: the value of each limit that would pass with the others unchanged, and the
+      ``factor`` on all limits that would pass; None if no value would.
+    - ``rms_position_m`` (horizontal), ``rms_height_m``, ``rms_heading_deg``, ``rms_score_m``.
     """
     zone = judged.zone
     row: dict[str, Any] = {
@@ -203,16 +203,16 @@ def short_row(judged: Judged) -> dict[str, Any]:
 
 
 def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
-    """`short_row` with the spread of the figures, and the worst places.
+    """Return `short_row` with the distribution of the errors, and the worst positions.
 
     ``position_m`` (horizontal), ``height_m``, ``heading_deg`` and ``score_m`` have ``rms``,
-    ``median``, ``p95`` and ``worst``; the last is sought on the zone's edges too, as are
-    ``worst_places``: some that are apart from each other, with their figures.
+    ``median``, ``p95`` and ``worst``. The worst value and ``worst_places``, which are apart from
+    each other, include the edges of the zone.
 
     Parameters
     ----------
     judged, edges
-        The zone, and `at_edges` of it.
+        Result of the zone, and its `at_edges`.
     """
     row = short_row(judged)
     for name, values in told(judged.judged).items():
@@ -227,15 +227,15 @@ def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
 
 
 def overview(judged: list[Judged], edges: list[Judged]) -> dict[str, Any]:
-    """Figures over all zones, as many places of each, of all three axes together.
+    """Return figures over all zones, with equally many positions of each.
 
-    ``position_m``, ``rotation_deg`` and ``score_m`` with ``rms``, ``median``, ``p95``, and
-    ``worst`` with ``worst_at_m``, which is sought on the edges too.
+    ``position_m``, ``rotation_deg`` and ``score_m``, over all three axes, have ``rms``, ``median``,
+    ``p95``, ``worst`` and ``worst_at_m``. The worst value includes the edges.
 
     Parameters
     ----------
     judged, edges
-        Every zone, and `at_edges` of it.
+        Results of all zones, and `at_edges` of each.
     """
     inner = [one.judged.of_places(slice(PLACES)) for one in judged]
     places = np.concatenate(
@@ -262,12 +262,13 @@ def overview(judged: list[Judged], edges: list[Judged]) -> dict[str, Any]:
 
 
 def at_edges(problem: Problem, anchors: FloatArray, judged: Judged) -> Judged:
-    """The same zone at places of a grid with its edges and corners.
+    """Return the errors of the same zone on a grid with its edges and corners.
 
     Parameters
     ----------
     problem, anchors, judged
-        What was judged; where it was without an anchor, so is this.
+        The problem, the anchors, and the result of the zone. If its verdict is without an anchor,
+        that anchor is missing here too.
     """
     places = free_grid(problem, judged.zone)
     left = anchors if judged.failing is None else np.delete(anchors, judged.failing, axis=0)
@@ -277,7 +278,7 @@ def at_edges(problem: Problem, anchors: FloatArray, judged: Judged) -> Judged:
 
 
 def told(errors: Errors) -> dict[str, FloatArray]:
-    """Errors by the names and units in which a zone's requirement is written; and b."""
+    """Return errors by the names and units of the requirements of a zone, and b."""
     return {
         "position_m": errors.horizontal,
         "height_m": errors.height,
@@ -287,7 +288,7 @@ def told(errors: Errors) -> dict[str, FloatArray]:
 
 
 def would_pass(judged: Judged) -> dict[str, float | None]:
-    """What would be met in the required share: each limit alone, and all by one ``factor``."""
+    """Return the values that would pass: of each limit alone, and one ``factor`` on all limits."""
     zone, limits = judged.zone, limits_of(judged.zone)
     result: dict[str, float | None] = {"factor": float(value_at_share(judged.relative, zone.share))}
     for name, key in _KEYS.items():
@@ -302,7 +303,7 @@ def would_pass(judged: Judged) -> dict[str, float | None]:
 
 
 def worst_places(judged: Judged) -> list[dict[str, float]]:
-    """Places where the zone is worst, apart from each other, with their figures."""
+    """Return the worst positions of a zone, apart from each other, with their errors."""
     order = judged.relative if judged.asks else judged.judged.score
     apart = _APART * float(np.linalg.norm(np.ptp(judged.places, axis=0)))
     open_ = np.ones(len(order), dtype=bool)
@@ -322,18 +323,18 @@ def worst_places(judged: Judged) -> list[dict[str, float]]:
 def judge(
     problem: Problem, anchors: FloatArray, seed: int, survive: int = 0, most: int | None = None
 ) -> list[Judged]:
-    """`judge_zone` of every zone. Arguments as there."""
+    """Return `judge_zone` of every zone. Arguments as there."""
     return [judge_zone(problem, zone, anchors, seed, survive, most) for zone in problem.zones]
 
 
 def score_of(problem: Problem, anchors: FloatArray, seed: int) -> float:
-    """b of a layout over all zones, judged on places that no search has seen."""
+    """Return b of a layout over all zones, at positions that no search has used."""
     judged = judge(problem, anchors, seed, most=PLACES)
     return float(overall_score(list(problem.zones), [one.errors.score for one in judged]))
 
 
 def overall_score(zones: list[Zone], scores: list[FloatArray]) -> FloatArray:
-    """b (...) over all zones: root of the mean of b^2 (..., L) by the weights of the zones."""
+    """Return b (...) over all zones: the root of the mean of b^2 (..., L), weighted by zone."""
     weights = np.array([zone.weight for zone in zones])
     squares = [(score**2).mean(axis=-1) for score in scores]
     return np.sqrt(np.tensordot(weights / weights.sum(), squares, axes=1))

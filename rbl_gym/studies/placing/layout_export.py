@@ -1,4 +1,4 @@
-"""A layout for those who mount it: a list, and files for a table, a map or a drawing program."""
+"""Export a layout for mounting: a list, and files for tables, maps or drawing programs."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from rbl_gym.placement.scene_files import Problem
 __all__ = ["LAYER", "SUFFIXES", "mounting_list", "write_layout"]
 
 SUFFIXES = (".csv", ".geojson", ".dxf")
-# Layer of a DXF that is written; what stood on it before is replaced.
+# Layer of the written DXF file; its previous content is replaced.
 LAYER = "RBL-ANCHORS"
-# A slab is at most so thick and at least so large: floors above z = 0 begin on one.
+# An obstacle is a floor slab if it is at most this thick and at least this large. Floors above z =
+# 0 begin on one.
 _SLAB_M, _SLAB_M2 = 0.6, 20.0
 # Radius of the circle that marks an anchor in a drawing, metres.
 _MARK_M = 0.15
@@ -30,19 +31,19 @@ _MARK_M = 0.15
 def mounting_list(
     problem: Problem, anchors: FloatArray, names: list[str] | None = None
 ) -> list[dict[str, Any]]:
-    """For each anchor what who mounts it needs, as plain values.
+    """Return what is needed to mount each anchor, as plain values.
 
-    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name), ``above_floor_m`` (z = 0, or the
-    top of the slab below), ``faces`` (``down``, ``+x``, an angle from +x in degrees, or ``any``),
-    and ``corners``: up to two dicts with ``x_m``, ``y_m`` of a corner of the mount and
-    ``distance_m`` along the wall or ceiling to it.
+    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name), ``above_floor_m`` (height above z =
+    0, or above the top of the slab below), ``faces`` (``down``, ``+x``, an angle from +x in
+    degrees, or ``any``), and ``corners``: up to two dicts with ``x_m``, ``y_m`` of a corner of the
+    mount and the distance ``distance_m`` to it along the wall or ceiling.
 
     Parameters
     ----------
     problem, anchors
-        Of which problem, and where (M, 3), metres.
+        The placement problem, and the anchor positions (M, 3), metres.
     names
-        Of the anchors; None: those of the file's order, from 1.
+        Names of the anchors; None: those of the file, numbered from 1.
     """
     anchors = check_array("anchors", anchors, ("M", 3))
     names = [str(k + 1) for k in range(len(anchors))] if names is None else names
@@ -66,7 +67,7 @@ def mounting_list(
 
 
 def floor_below(problem: Problem, point: FloatArray) -> float:
-    """Height of the floor below a point (3,): the top of the highest slab below it, or 0."""
+    """Return the height of the floor below a point (3,): the top of the highest slab, or 0."""
     prisms = problem.obstacles.prisms
     tops = [0.0]
     for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
@@ -77,7 +78,7 @@ def floor_below(problem: Problem, point: FloatArray) -> float:
 
 
 def direction(normal: FloatArray) -> str:
-    """Where an anchor looks, in words."""
+    """Return the direction an anchor faces, in words."""
     if not normal.any():
         return "any"
     if abs(normal[2]) > 0.99:
@@ -90,7 +91,7 @@ def direction(normal: FloatArray) -> str:
 
 
 def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[dict[str, float]]:
-    """The two ends of the wall, or two near corners of what is flat; none of points."""
+    """Return both ends of the wall, or two near corners of a flat mount; none for points."""
     faces, plan = problem.mounts.faces, anchor[:2]
     if not len(faces.origin) or not normal.any():
         return []
@@ -98,7 +99,7 @@ def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[d
     axes, extents = faces.axes[face], faces.extents[face]
     flat = [k for k in range(3) if extents[k] > 0 and abs(axes[k, 2]) < 0.5]
     if isinstance(problem.mounts, Mounts):
-        # What is left of the face where the anchor is: up to the walls that meet it.
+        # Free part of the face around the anchor, up to the walls that meet it.
         pieces = problem.mounts.pieces[problem.mounts.piece_face == face]
         pieces = pieces[(pieces[:, 6] - 1e-6 <= anchor[2]) & (anchor[2] <= pieces[:, 7] + 1e-6)]
         corners = _joined(pieces[:, :6].reshape(-1, 3, 2), plan)
@@ -109,7 +110,7 @@ def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[d
     distance = np.linalg.norm(corners - plan, axis=-1)
     nearest = np.argsort(distance, kind="stable").tolist() if len(corners) > 1 else []
     if len(flat) == 2 and nearest:
-        # Two tapes tell a place where they do not run along each other.
+        # Two tape measures fix a position only if they are not parallel.
         to = (corners - plan) / np.maximum(distance, 1e-9)[:, None]
         sine = np.abs(to[:, 0] * to[nearest[0], 1] - to[:, 1] * to[nearest[0], 0])
         across = [k for k in nearest[1:] if sine[k] >= 0.5] or [int(sine.argmax())]
@@ -125,7 +126,7 @@ def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[d
 
 
 def _joined(pieces: FloatArray, place: FloatArray) -> FloatArray:
-    """Corners (K, 2) of those pieces (N, 3, 2) of a face that hang together with a place (2,)."""
+    """Return corners (K, 2) of the pieces (N, 3, 2) of a face that connect to a position (2,)."""
     corners = np.round(pieces, 6)
     if not (corners[:, 1] == corners[:, 2]).all():
         return np.unique(corners.reshape(-1, 2), axis=0)
@@ -148,22 +149,22 @@ def _joined(pieces: FloatArray, place: FloatArray) -> FloatArray:
 def write_layout(
     problem: Problem, anchors: FloatArray, path: str, names: list[str] | None = None
 ) -> None:
-    """Write a layout, making its folder.
+    """Write a layout to a file; create its folder if necessary.
 
     Parameters
     ----------
     problem, anchors, names
-        As `mounting_list`.
+        As in `mounting_list`.
     path
-        `.csv`: the mounting list, which ``place --layout`` reads again. `.geojson`: points, in the
-        coordinates of the drawing where the problem was read from GeoJSON, else in metres.
-        `.dxf`: the layer `LAYER`, in a copy of the drawing where the problem was read from a DXF,
-        else with the building's outlines in metres.
+        ``.csv``: the mounting list, which ``place --layout`` can read. ``.geojson``: points, in the
+        coordinates of the drawing if the problem was read from GeoJSON, else in metres. ``.dxf``:
+        the layer `LAYER`, in a copy of the drawing if the problem was read from a DXF file, else
+        with the outlines of the building in metres.
 
     Raises
     ------
     ValueError
-        On another suffix.
+        If the file has another suffix.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
@@ -245,7 +246,7 @@ def _write_dxf(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
 
 
 def _draw_building(document: Any, problem: Problem) -> None:
-    """Outlines of obstacles and zones, on layers as `rbl-gym plan` knows them."""
+    """Add outlines of obstacles and zones, on layers that `rbl-gym plan` recognises."""
     model = document.modelspace()
     turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     boxes = problem.obstacles.boxes

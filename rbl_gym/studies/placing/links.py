@@ -15,18 +15,18 @@ __all__ = ["anchor_information", "layout_information", "link_shares"]
 def link_shares(
     problem: Problem, anchors: FloatArray, places: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Return the share (L, T, M, N) of its information that each link has, by obstacles and gain.
+    """Return the share (L, T, M, N) of the information of each link that obstacles and gain leave.
 
     The line of sight is from the anchor to the tag.
 
     Parameters
     ----------
     problem
-        Problem with tags, obstacles, and the gain of anchors.
+        The problem, with tags, obstacles, and the gain of the anchors.
     anchors
-        (M, 3), metres.
+        Positions (M, 3), metres.
     places, rotation
-        (L, 3), and rotations (T, 3, 3) of the body at each.
+        Positions (L, 3), and rotations (T, 3, 3) of the body at each.
     """
     tags = problem.tags
     share = np.ones((len(places), len(rotation), len(anchors), len(tags)))

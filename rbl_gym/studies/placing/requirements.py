@@ -31,7 +31,7 @@ __all__ = [
     "wilson_interval",
 ]
 
-# The turns of a body that may turn anyhow are the same for ever.
+# Random rotations of a free body are always the same.
 _TURN_SEED = 20130821
 
 
@@ -41,7 +41,7 @@ class Errors(NamedTuple):
     Attributes
     ----------
     position, rotation
-        Of all three axes together: metres, radians.
+        Over all three axes: metres, radians.
     score
         b, the root mean square error of the tags, metres.
     horizontal, height
@@ -63,7 +63,7 @@ class Errors(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """The `Errors` (...) that a zone may limit."""
+    """Errors (...) that a zone may limit, a subset of `Errors`."""
 
     horizontal: FloatArray
     height: FloatArray
@@ -71,14 +71,14 @@ class Asked(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits of the errors at a position: metres, metres, radians; infinite: no limit."""
+    """Limits of the errors at a position: metres, metres, radians; infinite if none."""
 
     horizontal: float = math.inf
     height: float = math.inf
     heading: float = math.inf
 
     def any(self) -> bool:
-        """Return whether one of them is finite."""
+        """Return whether any limit is finite."""
         return any(math.isfinite(limit) for limit in self)
 
 
@@ -111,30 +111,30 @@ def errors_of(
     rotation, tags
         Rotations (..., T, 3, 3), and tags (N, 3) on the body.
     part
-        (..., T, 6, 6), information to add: that of one more anchor, or minus that of one.
+        Information (..., T, 6, 6) to add: of one more anchor, or the negative of one to remove.
 
     Raises
     ------
     ValueError
-        If the information is singular: without a prior, with fewer ranges than a pose needs.
+        If the information is singular, as with fewer ranges than a pose needs and no prior.
     """
     args = information, _part(part, information), rotation, tags
     return Errors(*_roots(_mean_squares, *args))
 
 
 def asked_of(information: FloatArray, part: FloatArray | None = None) -> Asked:
-    """`errors_of` that a zone may ask for, in a third of its time. Arguments as there."""
+    """Return the part of `errors_of` that a zone may limit, three times faster."""
     return Asked(*_roots(_asked_squares, information, _part(part, information)))
 
 
 def _part(part: FloatArray | None, information: FloatArray) -> FloatArray:
-    """What is added to the information, nothing for None."""
+    """Return the information to add; zero for None."""
     part = np.zeros((1, 6, 6)) if part is None else part
     return np.broadcast_to(part, (*part.shape[:-3], *information.shape[-3:]))
 
 
 def _roots(squares: Compiled, *args: FloatArray) -> list[FloatArray]:
-    """Roots of what `squares` says, or a ValueError where an information is singular."""
+    """Return the square roots of `squares`; raise ValueError if singular."""
     try:
         found = squares(*args)
     except np.linalg.LinAlgError:
@@ -148,7 +148,7 @@ def _roots(squares: Compiled, *args: FloatArray) -> list[FloatArray]:
 def _mean_squares(
     base: FloatArray, part: FloatArray, rotation: FloatArray, tags: FloatArray
 ) -> tuple[FloatArray, ...]:
-    """Means over the turns of the squares of `Errors`, of the information base + part."""
+    """Return the mean squares of `Errors` over the rotations, for the information base + part."""
     P = np.linalg.inv(base + part)
     variance = np.einsum("...ii->...i", P)
     b = bounds.score(P, rotation, tags[..., None, :, :])
@@ -165,7 +165,7 @@ def _mean_squares(
 
 @compiled("place_errors:asked_squares")
 def _asked_squares(base: FloatArray, part: FloatArray) -> tuple[FloatArray, ...]:
-    """Means over the turns of the squares of `Asked`, of the information base + part."""
+    """Return the mean squares of `Asked` over the rotations, for the information base + part."""
     variance = np.einsum("...ii->...i", np.linalg.inv(base + part))
     squares = variance[..., 3] + variance[..., 4], variance[..., 5], variance[..., 2]
     return tuple(square.mean(axis=-1) for square in squares)
@@ -203,8 +203,8 @@ def value_at_share(values: FloatArray, share: float) -> FloatArray:
 
 
 def _rank(share: float, count: int) -> int:
-    """Index, in rising order, of the place that fills the share."""
-    # Shares are decimals: 0.95 of 100 places are 95, not 96.
+    """Return the index, in ascending order, of the position that fills the share."""
+    # Shares are decimals: 0.95 of 100 positions is 95, not 96.
     return min(max(math.ceil(share * count - 1e-9) - 1, 0), count - 1)
 
 
@@ -214,7 +214,7 @@ def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[floa
     Parameters
     ----------
     within, places
-        Number of positions within, and of all positions.
+        Number of positions within the requirement, and of all positions.
     level
         Probability that the interval contains the share.
     """
@@ -227,5 +227,5 @@ def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[floa
 
 
 def share_within(relative: FloatArray) -> BoolArray:
-    """Return the share (...) of positions (..., L) that are within."""
+    """Return the share (...) of positions (..., L) within the requirement."""
     return (relative <= 1).mean(axis=-1)

@@ -22,7 +22,7 @@ from rbl_gym.studies.what_if import SURVEYS_M, UNCALIBRATED
 
 __all__ = ["survey_rows", "surveyed_accuracy"]
 
-# Places of each zone; 95 % of a share are good to 3 % with so many.
+# Number of positions of each zone; a share of 95 % is then accurate to 3 %.
 _PLACES = 200
 
 
@@ -34,8 +34,9 @@ def survey_rows(
     Parameters
     ----------
     problem, anchors
-        The problem, and the anchors (M, 3).
+        The placement problem, and the anchor positions (M, 3).
     judged
+        Results of its zones, with the evaluated positions.
         Its zones, with the evaluated positions.
 
     Returns
@@ -99,7 +100,7 @@ def surveyed_accuracy(
     share = link_shares(problem, anchors, places, rotation)
     common = None
     if bias is not None:
-        # Within one epoch a bias of each link is noise; what all have in common is not.
+        # Within one epoch, the bias of a single link acts as noise; the common bias does not.
         spots = ranging.tag_positions(rotation, places[:, None], problem.tags)
         variance = problem.noise.variance(ranging.distances(anchors, spots))
         share = share / (1 + share * bias.std_m**2 / variance)

@@ -1,9 +1,9 @@
 """Choose layouts from a list of candidates, by their information at the poses of the zones.
 
-Information is a sum over the anchors, so that of a candidate is computed once, and a layout is a
-choice of candidates. The objective is the distance of the zones from their requirements, or b
-without requirements. For layouts that must survive the loss of any one anchor, it is the worst
-remaining case. The layouts are choices ``list[int]`` of candidates, those that stay come first.
+Information is a sum over the anchors. The information of each candidate is therefore computed once,
+and a layout is a choice of candidates, ``list[int]``; the fixed ones come first. The objective is
+the distance of the zones from their requirements, or b without requirements. For layouts that must
+survive the loss of any one anchor, it is the worst remaining case.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ from rbl_gym.studies.placing.requirements import (
 
 __all__ = ["Stock", "ZonePoses", "all_choices", "cheaper", "grown", "swapped", "value"]
 
-# An exchange must better the value by this share, or it is not worth the time.
+# An exchange must reduce the value by at least this share.
 _GAIN = 1e-3
-# Weight of the mean beside the place that fills the share: which of two layouts is better where
-# that place does not tell, and a slope where no layout is near the requirement.
+# Weight of the mean relative error beside the relative error at the required share. It decides
+# between layouts that are equal at that share, and gives a slope far from the requirement.
 _OF_MEAN = 1e-2
-# Of a long list of candidates, which are compared at every so many places, so many are tried at
-# all; for the loss of one, by the so many that are worst.
+# For a long list: step between the positions at which all candidates are compared, number of
+# candidates that are then tried exactly, and number of worst losses that are compared.
 _EVERY, _TRIED, _WORST_LOSSES = 4, 24, 3
-# Layouts that are tried at a time.
+# Number of layouts that are evaluated at a time.
 _CHUNK = 64
 
 
 class ZonePoses(NamedTuple):
-    """Poses of a zone, and their requirements.
+    """Poses of a zone, and its requirements.
 
     Attributes
     ----------
     places, rotation
-        (L, 3), and turns (T, 3, 3) at each of them.
+        Positions (L, 3), and rotations (T, 3, 3) at each of them.
     prior
         Information (6, 6) before any range.
     tags
-        (N, 3) on the body.
+        Tag positions (N, 3) on the body.
     limits, share
-        What a place may have, and in which share of the zone.
+        Limits of the errors at a position, and the required share of the zone within them.
     weight
-        Of the zone in the mean of b^2.
+        Weight of the zone in the mean of b^2.
     """
 
     places: FloatArray
@@ -72,9 +72,9 @@ class Stock(NamedTuple):
     zones
         Poses of each zone.
     parts
-        Of each zone (K, L, T, 6, 6): information of every candidate at every pose.
+        Information (K, L, T, 6, 6) of every candidate at every pose, for each zone.
     cost
-        Of every candidate (K,).
+        Cost (K,) of every candidate.
     """
 
     zones: tuple[ZonePoses, ...]
@@ -93,15 +93,15 @@ Base = Sequence[FloatArray]  # information (L, T, 6, 6) of each zone
 def value(stock: Stock, chosen: Sequence[int], survive: int = 0) -> float:
     """Return the objective of the search; requirements are met if it is at most 1.
 
-    The relative error at the place that fills the share of its zone, of the zone where it is
-    largest, with a hundredth of the mean relative error. Without requirements, b.
+    It is the relative error at the required share, of the zone where it is largest, plus a
+    hundredth of the mean relative error. Without requirements, it is b.
 
     Parameters
     ----------
     stock, chosen
-        Candidates, and which of them.
+        Candidates, and the indices of the chosen ones.
     survive
-        1: the worst over the loss of any one of the chosen.
+        1: use the worst case over the loss of any one chosen candidate.
     """
     total = _total(stock, chosen)
     if not survive:
@@ -114,16 +114,17 @@ def grown(
 ) -> Iterator[tuple[list[int], float]]:
     """Return greedy layouts: each is the previous one plus the candidate that helps most.
 
-    Ends with `count` anchors, or where no candidate is left.
+    The last layout has `count` anchors, or all candidates if there are fewer.
 
     Parameters
     ----------
     stock, chosen
-        Candidates, and with which of them to begin.
+        Candidates, and the indices to begin with.
     count
         The largest number of anchors.
     survive
-        As in `value`: of the values that are told, and of the choice where two anchors stand.
+        As in `value`. It applies to the returned values, and to the choice from the third anchor
+        on.
     """
     found, coarse = list(chosen), _coarse(stock)
     while len(found) < min(count, len(stock.cost)):
@@ -141,13 +142,13 @@ def swapped(
     Parameters
     ----------
     stock, chosen
-        Candidates, and with which of them to begin.
+        Candidates, and the indices to begin with.
     keep
-        So many of the first stay.
+        Number of first anchors that are not exchanged.
     survive
         As in `value`.
     sweeps
-        At most so many times over all anchors.
+        Maximum number of passes over all anchors.
     """
     found, best, coarse = list(chosen), value(stock, chosen, survive), _coarse(stock)
     for _ in range(sweeps):
@@ -168,7 +169,7 @@ def dropped(
 ) -> tuple[list[int], float]:
     """Return the layout without the least important anchor; the first `keep` are kept.
 
-    Arguments as `swapped`.
+    Arguments as in `swapped`.
     """
     tried = [[*chosen[:k], *chosen[k + 1 :]] for k in range(keep, len(chosen))]
     values = [value(stock, one, survive) for one in tried]
@@ -179,7 +180,7 @@ def dropped(
 def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0) -> list[int]:
     """Return a layout that still meets the requirements, after exchanges that save most cost.
 
-    Arguments as `swapped`.
+    Arguments as in `swapped`.
     """
     found = list(chosen)
     if value(stock, found, survive) > 1:
@@ -204,7 +205,7 @@ def all_choices(
 ) -> tuple[list[int], float]:
     """Return the best of all layouts of `count` candidates; the first `keep` are kept.
 
-    Arguments as `swapped`.
+    Arguments as in `swapped`.
     """
     kept = list(range(keep))
     best, least = kept, math.inf
@@ -245,7 +246,7 @@ def _less(stock: Stock, total: Base, k: int) -> Base:
 
 
 def _coarse(stock: Stock) -> Stock:
-    """The stock at every fourth place, by which most candidates of a long list are left out."""
+    """Return the stock at every fourth position, to exclude most candidates of a long list."""
     zones = tuple(zone._replace(places=zone.places[::_EVERY]) for zone in stock.zones)
     parts = tuple(np.ascontiguousarray(part[:, ::_EVERY]) for part in stock.parts)
     return Stock(zones, parts, stock.cost)
@@ -254,7 +255,7 @@ def _coarse(stock: Stock) -> Stock:
 def _best_added(
     stock: Stock, coarse: Stock, others: list[int], survive: int, limit: float
 ) -> tuple[int, float]:
-    """Which candidate betters the layout `others` most, and the value with it."""
+    """Return the candidate that improves the layout `others` most, and the value with it."""
     which = np.setdiff1d(np.arange(len(stock.cost)), others)
     if len(which) > _TRIED:
         rough = _with_candidates(coarse, others, None, survive, math.inf, _WORST_LOSSES)
@@ -273,18 +274,18 @@ def _with_candidates(
     limit: float,
     losses: int | None = None,
 ) -> FloatArray:
-    """Value (J,) of the layout `others` with each of the candidates `which`; None: of all.
+    """Return the value (J,) of the layout `others` with each of the candidates `which`.
 
-    Where the loss of one matters, infinite for a candidate that is no better than `limit`; of so
-    many `losses`, those that are worst without a candidate; None: of all.
+    None: all candidates. With `survive`, the value is infinite for a candidate that is no better
+    than `limit`. `losses` is the number of losses to test, the worst first; None: all.
     """
     base = _total(stock, others)
-    # All of them without a copy.
+    # A slice selects all of them without a copy.
     every = slice(None) if which is None else which
     if not survive:
         return _values(stock, base, every)
-    # The candidate itself may fail; then each of the others, the worst first, so that most
-    # candidates are left out early.
+    # The candidate itself may fail, or any of the others. The worst loss comes first, so that most
+    # candidates are excluded early.
     count = len(stock.cost) if which is None else len(which)
     worst = np.full(count, float(_values(stock, base)[0]))
     left = [(float(_values(stock, _less(stock, base, k))[0]), k) for k in others]
@@ -301,7 +302,7 @@ def _with_candidates(
 
 
 def _values(stock: Stock, base: Base, added: np.ndarray | slice | None = None) -> FloatArray:
-    """Value (J,) of information (..., L, T, 6, 6) with each of the added candidates, or none."""
+    """Return the value (J,) of information (..., L, T, 6, 6) plus each of the added candidates."""
     more = [None if added is None else part[added] for part in stock.parts]
     of_zones = list(zip(stock.zones, base, more, strict=True))
     if not stock.asks:
@@ -318,6 +319,6 @@ def _values(stock: Stock, base: Base, added: np.ndarray | slice | None = None) -
             worst.append(value_at_share(relative, zone.share))
             mean.append(relative.mean(axis=-1))
     q, slope = np.max(worst, axis=0), _OF_MEAN * np.mean(mean, axis=0)
-    # On the side of 1 that the requirements say.
+    # If the requirements are met, the value must not exceed 1.
     met = (1 - _OF_MEAN) * q + np.minimum(slope, _OF_MEAN)
     return np.atleast_1d(np.where(q <= 1, met, q + slope))
