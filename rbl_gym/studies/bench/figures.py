@@ -11,21 +11,21 @@ from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.monte_carlo import rms
 
 PARTS = ("position_m", "rotation_deg", "tags_m")
-# A trial is lost where its tags end off by more than this many bounds, and by more than the
-# prior said at the start.
+# A trial is lost if its tag error at the end exceeds this multiple of the bound, and the expected
+# error of the prior.
 LOST_BOUNDS = 10.0
-# Beyond this angle (degrees) at the end, a pose is one of the wrong side.
+# A pose with a larger rotation error (degrees) at the end is on the wrong side.
 FLIPPED_DEG = 90.0
 LEVEL = 0.95
 RESAMPLES = 2000
-# Digits that are kept of a figure: what differs beyond is rounding, not the filter.
+# Digits of a figure that are kept; further digits are rounding errors.
 _DIGITS = 9
 
 
 class BenchErrors(NamedTuple):
     """Errors of a filter over K epochs and B trials, (K, B) each.
 
-    `position_m`, `rotation_deg` and `tags_m` (root mean square over the tags) are lengths;
+    `position_m`, `rotation_deg` and `tags_m` (root mean square over the tags) are norms of errors;
     `nees` has `dof` degrees of freedom.
     """
 
@@ -58,8 +58,8 @@ class Reference(NamedTuple):
 def error_figures(errors: BenchErrors, reference: Reference | None) -> dict[str, Any]:
     """Return all figures of a filter under a condition, as plain numbers; None if not finite.
 
-    Without a reference (a recording, whose trials are stretches of it) what is relative to the
-    bound is absent, and what is of single epochs.
+    Without a reference (a recording, whose trials are segments of it), figures relative to the
+    bound and of single epochs are absent.
     """
     result: dict[str, Any] = {"per_trial": {}}
     for part in PARTS:
@@ -90,11 +90,11 @@ def error_figures(errors: BenchErrors, reference: Reference | None) -> dict[str,
 def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
     """Return the average NEES per degree of freedom (K, B), and the consistency of the filter.
 
-    Consistent beliefs have 1. At one epoch the sum over B trials is chi-square of ``dof B``
-    degrees of freedom; an average over epochs that depend on each other strays no farther, so
-    the interval of one epoch is a safe one: above it the filter is ``"optimistic"`` (its errors
-    are larger than it says), below it ``"pessimistic"``. `within` is the share of epochs whose
-    own average lies in the interval.
+    It is 1 for consistent beliefs. At one epoch, the sum over B trials is chi-square distributed
+    with ``dof B`` degrees of freedom. The average over dependent epochs varies no more than that,
+    so the interval of one epoch is a conservative one. Above it the filter is ``"optimistic"`` (its
+    errors are larger than its covariance says), below it ``"pessimistic"``. `within` is the share
+    of epochs whose average lies in the interval.
     """
     nees = _finite_or_inf(nees)
     low, high = (end / dof for end in nees_interval(nees.shape[1], dof, LEVEL))
@@ -110,7 +110,7 @@ def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
 
 
 def is_lost(tags_m: FloatArray, reference: Reference) -> np.ndarray:
-    """Trials (B,) that end, over the last quarter, worse than they began and far off the bound."""
+    """Return the trials (B,) that end worse than the prior and far from the bound."""
     last = slice(-max(1, len(tags_m) // 4), None)
     end = rms(_finite_or_inf(tags_m)[last], axis=0)
     bound = rms(reference.bound["tags_m"][last], axis=0)
@@ -118,10 +118,10 @@ def is_lost(tags_m: FloatArray, reference: Reference) -> np.ndarray:
 
 
 def is_flipped(errors: BenchErrors, reference: Reference) -> np.ndarray:
-    """Trials (B,) whose last pose is of the wrong side.
+    """Return the trials (B,) whose last pose is on the wrong side.
 
-    It is turned by more than 90 degrees, or nearer to the truth's mirror image behind the
-    anchors' plane than to the truth.
+    It is rotated by more than 90 degrees, or nearer to the mirror image of the truth behind the
+    plane of the anchors than to the truth.
     """
     flipped = ~(errors.rotation_deg[-1] <= FLIPPED_DEG)
     if reference.mirror_m is not None:
@@ -132,20 +132,20 @@ def is_flipped(errors: BenchErrors, reference: Reference) -> np.ndarray:
 def differences(
     per_trial: dict[str, dict[str, list[float | None]]], seed: int
 ) -> dict[str, dict[str, Any]]:
-    """How much worse each filter is than the best, by root mean squares over the trials.
+    """Return how much worse each filter is than the best one, by root mean squares over the trials.
 
     Parameters
     ----------
     per_trial
-        Of each filter, of each of `PARTS`, the root mean square error of every trial; all
-        filters saw the same trials.
+        By filter and by part in `PARTS`: the root mean square error of every trial. All filters run
+        on the same trials.
     seed
-        Of the resamples, which all filters share.
+        Seed of the resamples, which are the same for all filters.
 
     Returns
     -------
-    Of each filter and part: `best` (the filter with the least error), `difference`, and the ends
-    `low` and `high` of its 95 % interval by the paired bootstrap over trials; None where an
+    For each filter and part: `best` (the filter with the smallest error), `difference`, and the
+    limits `low` and `high` of its 95 % interval by the paired bootstrap over trials; None if an
     error is not finite.
     """
     names = list(per_trial)
@@ -162,7 +162,7 @@ def differences(
         if not np.isfinite(rmse).any():
             continue
         best = int(np.nanargmin(rmse))
-        # Trials without a figure are None, here NaN: they stay so through the sums.
+        # Trials without a figure are None, here NaN, which propagates through the sums.
         drawn = np.sqrt((resamples @ np.square(rows).T) / count)
         for k, name in enumerate(names):
             difference = drawn[:, k] - drawn[:, best]
@@ -181,7 +181,7 @@ def _finite_or_inf(values: FloatArray) -> FloatArray:
 
 
 def json_number(value: Any) -> Any:
-    """Numbers for JSON, to nine digits; None for what is not finite."""
+    """Convert numbers for JSON, to nine digits; None if not finite."""
     if value is None:
         return None
     if np.ndim(value):

@@ -1,8 +1,8 @@
 """Run every filter on every scene for `rbl-gym bench`: tasks, records and summary.
 
-A task is one world (scene and condition) and the filters that are run on it; it gives a record
-for each, plain numbers that depend on nothing but what the record itself names. Timings are kept
-apart from records.
+A task is one world (scene and condition) with the filters to run on it. It gives a record for each
+filter: plain numbers that depend only on the inputs named in the record. Timings are stored
+separately.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ __all__ = [
     "tasks",
 ]
 
-# Options with which a filter of ours stands in the table besides its plain self.
+# Options with which our own filters are also listed.
 VARIANTS = ("iekf/robust=true",)
-# Made for what few scenes have: a start that nobody knows, biased links, no odometry, an inertial
-# sensor. They take long.
+# Filters for rare features: an unknown start, biased links, no odometry, an inertial sensor. They
+# are slow.
 ELSEWHERE = ("iekf-bank", "iekf-bias", "iekf-cv", "iekf-imu", "iekf-log")
-# What makes a record another record; a finished one with the same is not run again.
+# Keys that identify a record; a finished record with the same values is not computed again.
 KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "versions")
 
 
@@ -64,7 +64,7 @@ class Task(NamedTuple):
 
 
 def default_filters() -> list[str]:
-    """Filters by name, ours and those of installed packages, and `VARIANTS`; not `ELSEWHERE`."""
+    """Return our filters, those of installed packages, and `VARIANTS`, but not `ELSEWHERE`."""
     return [*(name for name in estimators.names() if name not in ELSEWHERE), *VARIANTS]
 
 
@@ -95,19 +95,19 @@ def tasks(
     Parameters
     ----------
     specs
-        Scenes (for `scenes.get`) and recordings by their label in the table.
+        Scenes (for `scenes.get`) and recordings, by their labels in the table.
     conditions
         Names in `CONDITIONS`.
     filters
-        Names, with options as `estimators.parse_filter` reads them; None: `default_filters`, and
-        of every scene its `further_filters`.
+        Names with options, as in `estimators.parse_filter`; None: `default_filters`, and the
+        `further_filters` of every scene.
     trials, seed
         Number of trials of simulated scenes, and seed of all randomness.
 
     Raises
     ------
     ValueError
-        If a condition, filter, option or scene is unknown, before anything is run.
+        If a condition, filter, option or scene is unknown. It is raised before any run.
     """
     for condition in conditions:
         check_one_of("condition", condition, list(CONDITIONS))
@@ -238,9 +238,9 @@ def summary(
 
     Returns
     -------
-    A dict: ``conditions`` (what each is), ``rows``, one for each record without its lists per
-    trial, with ``difference`` to the best filter of the same world (see
-    `figures.differences`), and ``microseconds_per_step`` in the order of the rows.
+    A dict: ``conditions`` (their descriptions), ``rows``, and ``microseconds_per_step`` in the
+    order of the rows. There is one row for each record, without its lists per trial. Its
+    ``difference`` is relative to the best filter of the same world (see `figures.differences`).
     """
     rows = []
     for _, world in groupby(records, key=lambda r: (r["scene"], r["scene_hash"], r["condition"])):

@@ -1,4 +1,4 @@
-"""Recordings as scenes of the benchmark: one body, a real log, the conditions put on top."""
+"""Use recordings as scenes of the benchmark: one body, a real log, with added conditions."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from rbl_gym.studies.bench.worlds import (
 )
 
 FILES = ("ranges", "anchors", "tags", "truth", "calibration")
-# What of `replay.Settings` a recording sets; filters are the benchmark's.
+# Settings that a recording may set; the filter is chosen by the benchmark.
 _OF_FILTER = ("filter", "filter_options", "robust")
 SETTINGS = tuple(name for name in replay.Settings().flat() if name not in _OF_FILTER)
-# Stretches of equal length that stand for trials: errors within one are correlated.
+# Number of segments of equal length that serve as trials; errors within one are correlated.
 SEGMENTS = 20
 
 
 class Log(NamedTuple):
-    """A recording, how it is filtered, and the digest of all of it."""
+    """A recording, its settings, and the digest of all its inputs."""
 
     recording: Recording
     settings: replay.Settings
@@ -41,12 +41,12 @@ class Log(NamedTuple):
 
 
 def load_recording(spec: Mapping[str, Any]) -> Log:
-    """The recording that a mapping describes: its files, and fields of `replay.Settings`.
+    """Return the recording described by a mapping: its files, and fields of `replay.Settings`.
 
     Raises
     ------
     ValueError
-        On an unknown key, or one of ranges, anchors, tags and truth that is missing.
+        If a key is unknown, or ranges, anchors, tags or truth are missing.
     """
     unknown = [key for key in spec if key not in (*FILES, *SETTINGS)]
     if unknown:
@@ -57,19 +57,19 @@ def load_recording(spec: Mapping[str, Any]) -> Log:
             raise ValueError(f"a recording needs the key {key!r}, got {', '.join(spec)}")
     files = [Path(spec[key]).stat() for key in FILES if key in spec]
     stamps = tuple((file.st_mtime_ns, file.st_size) for file in files)
-    # What JSON gives as a list cannot be the key of a cache.
+    # Lists from JSON are not hashable, as the cache needs.
     items = ((key, tuple(x) if isinstance(x, list) else x) for key, x in spec.items())
     return _load(tuple(sorted(items)), stamps)
 
 
 @functools.lru_cache(maxsize=2)
 def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...]) -> Log:
-    """`load_recording` of a checked mapping; the stamps tell files that were written again."""
+    """Load the recording of a checked mapping; the stamps identify files that have changed."""
     spec = dict(items)
     paths = {key: spec[key] for key in FILES if key in spec}
     recording = read_recording(**paths)
     settings = replay.Settings.of(**{key: spec[key] for key in SETTINGS if key in spec})
-    # Said once and for all: a condition may put an anchor at another height.
+    # The offset is fixed here, because a condition may change the height of an anchor.
     offset = replay.height_offset(recording, settings)
     settings = settings.changed(height_offset_m=offset)
     digest = hashlib.sha256(repr([item for item in items if item[0] not in FILES]).encode())
@@ -86,7 +86,7 @@ class Stressed(NamedTuple):
 
 
 def stressed(log: Log, condition: str, seed: int) -> Stressed:
-    """The condition put on a recording; its own errors stay what they are."""
+    """Apply a condition to a recording, in addition to the errors it already has."""
     told, settings = log.recording, log.settings
     rng = np.random.default_rng([seed, int(log.digest, 16)])
     if condition == "nlos":
@@ -102,7 +102,7 @@ def stressed(log: Log, condition: str, seed: int) -> Stressed:
         std = (settings.range_std_m or replay.DEFAULT_RANGE_STD_M) / NOISE_FACTOR
         return Stressed(told, dataclasses.replace(settings, range_std_m=std))
     if condition == "anchor-off":
-        # The same error all the time, of an anchor that moves too.
+        # The error is constant, also for a moving anchor.
         anchors = told.anchors + off_by(np.zeros(told.anchors.shape[-2:]), ANCHOR_ERROR_M, rng)
         return Stressed(told._replace(anchors=anchors), settings)
     if condition == "tag-off":
@@ -111,7 +111,7 @@ def stressed(log: Log, condition: str, seed: int) -> Stressed:
 
 
 def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:
-    """Errors where truth is known, its epochs cut into `SEGMENTS` stretches."""
+    """Return the errors at epochs with truth, split into `SEGMENTS` segments."""
     found = replay.track_errors(log.recording, track, log.settings)
     assert found is not None
     if found.rotation is None or found.tags is None:

@@ -1,7 +1,7 @@
 """Store records of the benchmark in a file of JSON lines: save, resume, run again.
 
-Lines are in the order of the tasks once a run is complete, and hold nothing that changes from
-run to run; how long each filter took stands in a file beside it.
+In the file of a complete run, lines are in the order of the tasks. They hold nothing that changes
+from run to run; processor times are in a separate file next to it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 Records = list[dict[str, Any]]
-# What all records of one file have in common.
+# Fields that all records of a file share.
 _COMMON = ("trials", "seed", "versions")
 
 
@@ -44,9 +44,9 @@ def run_tasks(
 ) -> tuple[Records, dict[tuple[str, ...], float]]:
     """Run tasks that are missing in a file; return all records, in order, and their times.
 
-    Every finished task is written before the next result is awaited. The same call resumes an
-    interrupted run. Records of other scenes, conditions or filters of the same trials, seed and
-    versions stay in the file, behind those of the tasks.
+    Every finished task is written immediately, so that the same call resumes an interrupted run.
+    Records of other scenes, conditions or filters with the same trials, seed and versions stay in
+    the file, after those of the tasks.
 
     Parameters
     ----------
@@ -64,8 +64,8 @@ def run_tasks(
     Raises
     ------
     ValueError
-        If the file holds records of other trials, another seed or other versions, or a worker
-        has other versions.
+        If the file holds records with other trials, seed or versions, or a worker has other
+        versions.
     """
     if fresh:
         for file in (path, timings_path(path)):
@@ -77,7 +77,7 @@ def run_tasks(
         else {}
     )
     _check_same_run(path, list(found.values()), tasks)
-    # A line that a kill cut in half must not run into the next.
+    # An incomplete last line must not be joined to the next one.
     _write(path, list(found.values()))
     advance(sum(key in found for key in wanted))
     with path.open("a", encoding="utf-8") as file, timings_path(path).open("a") as times:
@@ -118,7 +118,7 @@ def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None
 
 
 def read_records(path: Path) -> Records:
-    """Read the records of a file; a last line that was cut off is left out.
+    """Read the records of a file; an incomplete last line is ignored.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def read_timings(path: Path) -> dict[tuple[str, ...], float]:
             row = json.loads(line)
             times[leaderboard.timing_key(row)] = row["microseconds_per_step"]
         except (ValueError, KeyError, TypeError, RecursionError):
-            continue  # a time that cannot be read is no time
+            continue  # an unreadable time is ignored
     return times
 
 
@@ -179,7 +179,7 @@ def _write(path: Path, records: Records) -> None:
     os.replace(beside, path)
 
 
-# --- once more ------------------------------------------------------------------------------
+# --- reproduce ------------------------------------------------------------------------------
 
 
 def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
@@ -248,11 +248,10 @@ def rerun(
 
     Returns
     -------
-    A dict: ``records`` and ``identical`` (how many), ``changed``: rows with scene, condition,
-    filter, ``relative_change`` (the largest of a figure; None where something other than a
-    number changed), ``field`` (where that is), ``before`` and ``after``; ``versions``: name to
-    the two versions, where they differ; ``sources``: the same of filters and scenes whose own
-    files changed.
+    A dict. ``records`` and ``identical`` are counts. ``changed`` has rows with scene, condition,
+    filter, ``relative_change`` (the largest of a figure; None if another value changed), ``field``
+    (its name), ``before`` and ``after``. ``versions`` has the two versions by name where they
+    differ; ``sources`` has the same for filters and scenes whose own files changed.
     """
     before = {_place(record): record for record in records}
     rows, versions, sources, identical = [], {}, {}, 0

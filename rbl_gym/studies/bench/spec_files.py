@@ -1,6 +1,6 @@
-"""Scenes of the benchmark from names and files: a named one, one with changes, a recording.
+"""Read scenes of the benchmark from names and files: named scenes, changed scenes, recordings.
 
-Besides the named scenes the benchmark has `SENSED`: the same with other sensors, or a survey.
+`SENSED` has further scenes: named ones with other sensors, or with a survey.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from rbl_gym.studies.bench.recordings import FILES
 
 __all__ = ["SENSED", "read_spec", "scene_specs"]
 
-# Named scenes with an inertial sensor, with an unknown offset of every tag's ranges (time
-# differences), and with anchors whose surveyed places are 5 cm off on every axis.
+# Named scenes with an inertial sensor, with an unknown range offset of every tag (time
+# differences), and with anchors whose surveyed positions are 5 cm off on every axis.
 SENSED: dict[str, dict[str, Any]] = {
     "uwb_room-imu": {"name": "uwb_room", "inertial": "consumer"},
     "drone_yard-imu": {"name": "drone_yard", "inertial": "consumer"},
@@ -27,18 +27,18 @@ SENSED: dict[str, dict[str, Any]] = {
 
 
 def scene_specs(names: Sequence[str]) -> dict[str, str | dict[str, Any]]:
-    """Scenes by label, each checked to be readable: what `leaderboard.tasks` takes.
+    """Return scenes by label, checked for errors, for `leaderboard.tasks`.
 
     Parameters
     ----------
     names
-        Names of scenes or of `SENSED`, or of files ``.toml`` and ``.json`` (`read_spec`), which
-        have the name of the file without its ending as label.
+        Names of scenes or of `SENSED`, or ``.toml`` and ``.json`` files (`read_spec`), whose label
+        is the file name without its suffix.
 
     Raises
     ------
     ValueError
-        If two have one label, or a file does not describe a scene or a recording.
+        If two scenes have the same label, or a file describes neither a scene nor a recording.
     """
     specs: dict[str, str | dict[str, Any]] = {}
     for name in names:
@@ -58,12 +58,12 @@ def scene_specs(names: Sequence[str]) -> dict[str, str | dict[str, Any]]:
 
 
 def read_spec(path: Path) -> dict[str, Any]:
-    """A mapping for `scenes.get`, or one of a recording, its files found beside this one.
+    """Return the mapping of a scene (`scenes.get`) or a recording; paths are relative to the file.
 
     Raises
     ------
     ValueError
-        If the file is neither; the message names it.
+        If the file describes neither; the message names it.
     """
     try:
         text = path.read_text(encoding="utf-8")

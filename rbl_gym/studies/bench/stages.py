@@ -18,7 +18,7 @@ from rbl_gym.worlds import scenes
 
 
 class Tracked(NamedTuple):
-    """The run of a filter: beliefs (K, B, ...), how often it triggered, its time in seconds."""
+    """The run of a filter: beliefs (K, B, ...), number of triggers, processor time in seconds."""
 
     belief: estimators.PoseBelief
     trigger_rate: float | None
@@ -26,7 +26,7 @@ class Tracked(NamedTuple):
 
 
 class StoppedError(Exception):
-    """A filter raised an error: the epoch and the error."""
+    """Raised if a filter raised an error: the epoch and the error."""
 
     def __init__(self, epoch: int, error: Exception) -> None:
         super().__init__(epoch, error)
@@ -34,19 +34,19 @@ class StoppedError(Exception):
 
 
 class BenchStage(NamedTuple):
-    """A world of the benchmark for filters.
+    """A world of the benchmark, on which filters run.
 
     Attributes
     ----------
     make
-        A filter of a name and options that knows what it is told.
+        Function that makes a filter from a name and options, with the laws known to filters.
     track
-        A filter over all epochs.
+        Function that runs a filter over all epochs.
     figures
-        All figures of what it did.
+        Function that computes all figures of a run.
     anchors, tags
-        True geometry. `pose_rank` is the number of pose directions that it determines, None if
-        that depends on the path.
+        The true geometry. `pose_rank` is the number of pose directions that it determines, None if
+        this depends on the path.
     batch
         Leading axes of a belief.
     """
@@ -61,7 +61,7 @@ class BenchStage(NamedTuple):
 
 
 def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> BenchStage:
-    """The stage of a simulated scene."""
+    """Return the stage of a simulated scene."""
     world = worlds.simulate_condition(scenes.get(spec), condition, trials, seed)
     told = world.told
     mirror = worlds.mirrored(world)
@@ -86,7 +86,7 @@ def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> BenchStage
 
 
 def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> BenchStage:
-    """The stage of a recording; its trials are stretches of it."""
+    """Return the stage of a recording; its trials are segments of it."""
     log = recordings.load_recording(spec)
     told, settings = recordings.stressed(log, condition, seed)
 
@@ -110,9 +110,10 @@ def run_filter(
 ) -> tuple[dict[str, Any], float | None]:
     """Run a filter on a stage; return its record, and its microseconds per step and trial.
 
-    `status` is ``"ok"``; ``"unobservable"`` if the geometry does not determine its states
-    (it relies on its prior); ``"refused"`` if it raised a ValueError; ``"failed"`` if it raised
-    another error. `message` gives the epoch and the error; these two have no time.
+    `status` is ``"ok"``; ``"unobservable"`` if the geometry does not determine the states (the
+    filter then relies on its prior); ``"refused"`` if the filter raised a ValueError; ``"failed"``
+    if it raised another error. For the last two, `message` gives the epoch and the error, and there
+    is no time.
     """
     result: dict[str, Any] = {"status": "ok", "message": None}
     result["rank"], result["states"] = stage.pose_rank, 6
@@ -135,9 +136,9 @@ def run_filter(
 
 
 def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
-    """All beliefs of a filter; a StoppedError where it raises or gives none."""
+    """Return all beliefs of a filter; raise StoppedError if it fails or has no beliefs."""
     beliefs, triggers, seconds = [], [], 0.0
-    # What a filter that diverges overflows is told by its figures.
+    # Overflow of a diverging filter shows in its figures.
     with np.errstate(all="ignore"):
         try:
             for step, taken in timed(steps):
@@ -157,7 +158,7 @@ def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
 
 
 def _stopped(stop: StoppedError) -> dict[str, Any]:
-    """A ValueError is a refusal, in words that name what is missing; anything else is a fault."""
+    """Return the status: ``"refused"`` for a ValueError, ``"failed"`` for any other error."""
     refused = isinstance(stop.error, ValueError)
     kind = "" if refused else f"{type(stop.error).__name__}: "
     return {
@@ -173,7 +174,7 @@ def _errors(world: worlds.BenchWorld, belief: estimators.PoseBelief) -> BenchErr
 
 
 def _expected(world: worlds.BenchWorld) -> dict[str, FloatArray]:
-    """Errors (K, B) that the bound expects, by part."""
+    """Return the errors (K, B) expected by the bound, by part."""
     variance = np.diagonal(world.bound, axis1=-2, axis2=-1)
     return {
         "position_m": np.sqrt(variance[..., 3:].sum(axis=-1)),
@@ -183,7 +184,7 @@ def _expected(world: worlds.BenchWorld) -> dict[str, FloatArray]:
 
 
 def _prior_tags(world: worlds.BenchWorld) -> FloatArray:
-    """Tag error (B,) that the prior expects; no rotation is farther off than a random one."""
+    """Return the tag error (B,) expected by the prior; rotation errors are at most random ones."""
     rotation, _, covariance = world.prior
     spread = np.sqrt(np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1) / 3)
     scale = np.ones((*covariance.shape[:-2], 6))

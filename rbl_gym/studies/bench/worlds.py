@@ -1,8 +1,8 @@
-"""Simulate the worlds of the benchmark: the data of filters, the truth, and their differences.
+"""Simulate the worlds of the benchmark: the truth, and the data for filters.
 
-A world is a batch of episodes of a scene under a condition. Its random numbers do not depend on
-the filter, and those of motion, prior and ranges not on the condition either: every comparison
-is paired.
+A world is a batch of episodes of a scene under a condition. Its random numbers do not depend on the
+filter. Those of motion, prior and ranges do not depend on the condition either. Every comparison is
+therefore paired.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CONDITIONS = {
     "anchor-off": "the filter's position of the first anchor is 0.5 m off, in a random direction",
     "tag-off": "the filter's position of the first tag is 5 cm off",
 }
-# Which stream of a scene's randomness: what happens, the links besides, the errors of the told.
+# Streams of random numbers of a scene: episodes, additional links, errors of the known laws.
 _WORLD, _LINKS, _TOLD = range(3)
 
 
@@ -48,12 +48,12 @@ class BenchWorld(NamedTuple):
     rotation, translation
         True poses (K, B, 3, 3), (K, B, 3).
     readings
-        The inputs of filters, one per epoch.
+        Inputs of filters, one per epoch.
     prior
         Rotation, translation and covariance before the first epoch.
     bound
-        Posterior Cramer-Rao covariance (K, B, 6, 6) under the true laws and the links that
-        gave a range; reflected ones count as clean.
+        Posterior Cramer-Rao covariance (K, B, 6, 6) under the true laws, for the links with a
+        range; reflected ranges count as direct.
     anchors
         True positions (B, M, 3).
     """
@@ -121,7 +121,7 @@ def _noisier(noise: Any, factor: float) -> Any:
 
 
 def _draws(scene: Scene, true: Scene, trials: int, entropy: list[int]) -> simulation.Draws:
-    """The scene's own random numbers; what the condition's links need besides comes after."""
+    """Draw the random numbers of the scene first, then those for additional links."""
     draws = simulation.draw(scene, np.random.default_rng([*entropy, _WORLD]), (trials,))
     more = simulation.empty_draws(true, 1).uniforms.shape[-1] - draws.uniforms.shape[-1]
     besides = np.random.default_rng([*entropy, _LINKS]).random((trials, more))
@@ -142,7 +142,7 @@ def _told(
 
 
 def off_by(points: FloatArray, distance_m: float, rng: np.random.Generator) -> FloatArray:
-    """Points (..., N, 3), the first of them moved by a distance in a random direction."""
+    """Return points (..., N, 3), the first moved by a distance in a random direction."""
     direction = rng.standard_normal((*points.shape[:-2], 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     moved = np.array(points)
@@ -151,7 +151,7 @@ def off_by(points: FloatArray, distance_m: float, rng: np.random.Generator) -> F
 
 
 def pose_rank(world: BenchWorld) -> int:
-    """How many of the 6 directions of the pose the first epoch's full links determine."""
+    """Return how many of the 6 pose directions the first epoch determines if no link is missing."""
     information = bounds.information_at(
         world.anchors, world.tags, world.rotation[0], world.translation[0], world.told.noise,
         offset=world.told.links.offset,
@@ -160,7 +160,7 @@ def pose_rank(world: BenchWorld) -> int:
 
 
 def mirrored(world: BenchWorld) -> FloatArray | None:
-    """Images (K, B, 3) of the true positions behind the plane of the anchors, if they have one."""
+    """Return images (K, B, 3) of the true positions behind the anchor plane; None without one."""
     centre = world.anchors.mean(axis=-2)
     _, size, axes = np.linalg.svd(world.anchors - centre[:, None], full_matrices=False)
     if world.anchors.shape[-2] < 3 or not (size[:, 2] <= 1e-6 * size[:, 0]).all():
@@ -170,21 +170,21 @@ def mirrored(world: BenchWorld) -> FloatArray | None:
     return world.translation - 2 * height[..., None] * normal
 
 
-# Fields that scenes got after the first leaderboard. They count where they differ from their
-# default: the other scenes keep their hash, from which the seed of their trials comes.
+# Fields added to scenes after the first leaderboard. They enter the hash only if they differ from
+# their default. Other scenes keep their hash, and with it the seed of their trials.
 _YOUNGER_FIELDS = frozenset(
     {"inertial", "offset", "offset_std_m", "survey_std_m", "prisms", "gain", "fixed"}
 )
 
 
 def scene_hash(scene: Scene) -> str:
-    """Sixteen hexadecimal digits of everything that makes the scene."""
+    """Return sixteen hexadecimal digits that identify all fields of a scene."""
     text = json.dumps(scene_facts(scene), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def scene_facts(value: Any) -> Any:
-    """A scene as plain numbers, lists and dicts; parts of several kinds carry their `kind`."""
+    """Return a scene as plain numbers, lists and dicts; some parts have a `kind`."""
     if dataclasses.is_dataclass(value):
         fields = {
             f.name: scene_facts(getattr(value, f.name))

@@ -32,7 +32,7 @@ _LEVELS = 5
 _BLOCK = 40_000
 # Rotation std of the prior that regularises the bound, and information of a known tilt.
 _PRIOR_ROTATION_RAD, _KNOWN = math.radians(60), 1e12
-# Maximum number of draws from a zone's bounding box, and positions per draw.
+# Maximum number of draws from a bounding box, and minimum number of positions per draw.
 _DRAWS, _DRAWN = 200, 4096
 
 

@@ -27,7 +27,7 @@ __all__ = ["Cause", "likely_causes"]
 
 # Number of ranges to use, and minimum and maximum number of epochs.
 _RANGES, _FEWEST, _MOST = 6_000, 100, 1_500
-# To be reported, causes together must remove the first share of the excess, each the second.
+# Shares of the excess that the causes together, and each of them, must remove to be reported.
 _ENOUGH, _WORTH = 0.5, 0.1
 
 
@@ -105,7 +105,7 @@ def likely_causes(
         ratio = float(chosen.nis.sum() / max(chosen.dof.sum(), 1))
         share = left - after
         if causes and causes[-1].kind == kind:
-            # More of the same.
+            # The same fault was found again.
             share += causes.pop().mended
         causes.append(Cause(kind, text, ratio, share))
         left, trial = after, mended

@@ -1,5 +1,7 @@
-"""Estimate the clock offset of a sensor from the ranges: for odometry by their likelihood, for an
-inertial sensor by the accelerations of the estimated path.
+"""Estimate the clock offset of a sensor from the ranges.
+
+For odometry the likelihood of the ranges is used, for an inertial sensor the accelerations of the
+estimated path.
 """
 
 from __future__ import annotations
@@ -18,10 +20,10 @@ from rbl_gym.studies.replay.settings import Settings
 
 __all__ = ["CLOCK_TRIALS", "SensorClock", "sensor_clock"]
 
-# Spacing of the tested offsets, on both sides of the given one, first coarse, then finer.
+# Spacing of the tested offsets, first coarse, then finer, and their number on each side.
 _STEPS, _SIDES = (0.4, 0.1, 0.03), (7, 3, 3)
 CLOCK_TRIALS = len(_STEPS)
-# Longest part used, in epochs; for an inertial sensor in ranges, and the search range (s).
+# Longest part used: in epochs, for an inertial sensor in ranges; and its search range (s).
 _MOST, _MOST_RANGES, _SEARCH_S = 1_500, 60_000, 10.0
 
 
@@ -118,7 +120,7 @@ def _inertial_clock(recording: Recording, settings: Settings) -> SensorClock:
     )
     start = start_of(recording, settings)[1]
     if settings.knowledge.start is None:
-        # Outside the plane of coplanar anchors.
+        # Start outside the plane of coplanar anchors.
         start = start - [0.0, 0.0, 0.5]
     near = settings.inertial.imu_offset_s
     try:

@@ -69,7 +69,7 @@ def contradicts(found: Innovations, recording: Recording) -> bool:
 
 
 def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatArray, ...]:
-    """Return NIS, used and rejected ranges of this number of parts of a log."""
+    """Return NIS, used and rejected ranges for this number of parts of a log."""
     links = recording.links.sum(axis=(1, 2))
     starts = np.unique(np.linspace(0, len(links), blocks, endpoint=False).astype(int))
     nis, dof, links = (np.add.reduceat(a, starts) for a in (found.nis, found.dof, links))
@@ -79,16 +79,17 @@ def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatA
 def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> BoolArray:
     by_chance = special.chdtri(np.maximum(dof, 1), _CHANCE)
     lost = refused > MOST_REFUSED * (dof + refused)
-    # A single wrong range in five is not reported.
+    # A single wrong range among five is not reported.
     return (nis > np.maximum(MOST_NIS * dof, by_chance)) | (lost & (refused > _BLOCKS))
 
 
 def residual_tables(found: Innovations, recording: Recording) -> dict[str, list[dict[str, Any]]]:
     """Return tables of residuals after the update, by anchor, by tag and by link.
 
-    A row has the ids, ``ranges`` (how many), ``mean_m`` of those used, ``spread_m`` of all (1.4826
-    times the median distance from the median: the standard deviation of a Gaussian), and
-    ``refused_share``. Points and links without ranges have no row.
+    A row has the ids, ``ranges`` (their number), ``mean_m`` over the used ranges, ``spread_m`` over
+    all ranges, and ``refused_share``. The spread is 1.4826 times the median distance from the
+    median, which is the standard deviation of a Gaussian. Points and links without ranges have no
+    row.
     """
     links = recording.links
     M, N = links.shape[1:]

@@ -40,7 +40,7 @@ def diagnose(
             )
         return {**figures, "causes": []}, notes
     if recording.offset is not None:
-        # What is supposed of ranges does not hold of their differences.
+        # The tested faults concern ranges, not their differences.
         text = _subject(figures) + "Look at the residuals of anchors, tags and links; see --tune."
         return {**figures, "causes": []}, [text]
     causes = likely_causes(recording, settings, found, track[1:3])
@@ -49,7 +49,7 @@ def diagnose(
 
 def _subject(figures: dict[str, Any]) -> str:
     ratio, refused = figures["nis_per_dof"], figures["refused_share"]
-    # Of one link among many neither figure tells.
+    # With one bad link among many, neither NIS nor the rejected share is large.
     subject = "the filter does not fit its data"
     if ratio < MOST_NIS and refused < MOST_REFUSED:
         subject = "a part of the ranges does not fit the filter"

@@ -19,7 +19,7 @@ from rbl_gym.studies.replay.place import level_of, own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import prior_of, recording_filter, sensed
 
-# Trials that run at once: more fall out of the processor's caches.
+# Number of trials that run at once; with more, the data no longer fit into the processor caches.
 _TOGETHER = 64
 
 
@@ -40,7 +40,7 @@ class Evidence(NamedTuple):
     rotation, translation
         Poses after every epoch, (B, K, 3, 3) and (B, K, 3).
     residual
-        (B, K, M, N), metres.
+        Residuals (B, K, M, N), metres.
     """
 
     log_likelihood: FloatArray
@@ -51,11 +51,11 @@ class Evidence(NamedTuple):
     residual: FloatArray
 
     def part(self, trials: slice) -> Evidence:
-        """What some of the trials make of them."""
+        """Return the results of some of the trials."""
         return Evidence(*(field[trials] for field in self))
 
     def with_more(self, other: Evidence) -> Evidence:
-        """What these trials and then others make of the same epochs."""
+        """Return these results followed by those of other trials over the same epochs."""
         return Evidence(*map(np.concatenate, zip(self, other, strict=True)))
 
 
@@ -67,8 +67,8 @@ def evidence(trials: Sequence[Trial]) -> Evidence:
     Parameters
     ----------
     trials
-        Their recordings differ in ranges, their deviations, anchors and tags, and in which links
-        count; their settings in whatever they like.
+        Recordings may differ in ranges, their standard deviations, anchors, tags, and used links.
+        Settings may differ in any field.
     """
     found: list[tuple[FloatArray, ...] | None] = [None] * len(trials)
     groups: dict[Any, list[int]] = {}
@@ -83,7 +83,7 @@ def evidence(trials: Sequence[Trial]) -> Evidence:
 
 
 def _same_filter(recording: Recording, settings: Settings) -> tuple[Settings, bytes]:
-    """What trials that run as one have in common: of the iterated EKF each has its own motion."""
+    """Return the settings that trials run together must share; motion may differ for `iekf`."""
     tags = recording.tags.tobytes()
     if settings.filter == "iekf":
         settings, tags = settings.changed(walk_m=0.0, walk_deg=0.0), b""
@@ -91,7 +91,7 @@ def _same_filter(recording: Recording, settings: Settings) -> tuple[Settings, by
 
 
 def _tried(trials: list[Trial]) -> Iterator[tuple[FloatArray, ...]]:
-    """Results of trials that run as one; alone, where one of them spoils it for all."""
+    """Yield results of trials that run together, or one by one if one of them raises an error."""
     try:
         yield from _together(trials)
     except (TypeError, ValueError, np.linalg.LinAlgError):
@@ -121,7 +121,7 @@ def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
 
 
 def _stacked(filters: list[Any]) -> estimators.Filter:
-    """Filters of one group as one: those that differ in tags and motion with leading axes."""
+    """Return one filter for a group; tags and motion get a leading axis if they differ."""
     first = filters[0]
     if len(filters) == 1 or not isinstance(first, IteratedEkf):
         return first
@@ -132,7 +132,7 @@ def _stacked(filters: list[Any]) -> estimators.Filter:
 
 
 def _readings(trials: list[Trial]) -> Iterator[Reading]:
-    """The epochs of all trials, (B, ...)."""
+    """Yield the epochs of all trials, arrays (B, ...)."""
     logs = [trial.recording for trial in trials]
     times = logs[0].times
     ranges, links = np.stack([log.ranges for log in logs]), np.stack([log.links for log in logs])

@@ -1,4 +1,4 @@
-"""Errors of a replayed recording against its truth, its figures, and what is to be said."""
+"""Compute the figures of a replayed recording, its errors against the truth, and its notes."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from rbl_gym.studies.replay.truth import Judged, fault_hints, judged_of, matched
 
 __all__ = ["track_figures"]
 
-# The mirror pose is the one meant where its mean square error is below this share of the track's.
+# The truth is at the mirror pose if its mean square error is below this share of the track's.
 _NEARER = 0.25
-# So many epochs tell how late the truth is.
+# Number of epochs that is sufficient to estimate the delay of the truth.
 _ENOUGH = 1000
 
 
 def track_figures(
     recording: Recording, track: Track, found: TrackErrors | None, settings: Settings
 ) -> dict[str, Any]:
-    """The figures of a run as plain numbers.
+    """Return the figures of a run as plain numbers.
 
     Parameters
     ----------
     recording, track, settings
-        What was filtered, what came out, and how.
+        The recording, its track, and the settings.
     found
-        Of `track_errors`; None: figures of errors are absent.
+        Result of `track_errors`; None: without figures of errors.
     """
     result: dict[str, Any] = {
         "settings": {
@@ -64,7 +64,7 @@ def track_figures(
 
 
 def smoothed_figures(smoothed: SmoothedRecording, found: TrackErrors | None) -> dict[str, Any]:
-    """The figures of a smoothed track, and of its errors where there are any."""
+    """Return the figures of a smoothed track, and of its errors if there are any."""
     fit = smoothed.found
     return {
         "seconds": smoothed.seconds,
@@ -75,7 +75,7 @@ def smoothed_figures(smoothed: SmoothedRecording, found: TrackErrors | None) -> 
 
 
 def error_figures(found: TrackErrors) -> dict[str, float]:
-    """Root mean squares, medians and 95 % quantiles of the errors, and the mean NEES."""
+    """Return root mean squares, medians and 95 % quantiles of the errors, and the mean NEES."""
     known, result = found.known, {}
     for name, values in (
         ("position_{}_m", found.position),
@@ -97,7 +97,7 @@ def error_figures(found: TrackErrors) -> dict[str, float]:
 
 
 def _comparison(recording: Recording, track: Track, settings: Settings) -> dict[str, Any]:
-    """How track and truth were brought together."""
+    """Return how track and truth were matched."""
     truth = truth_of(recording, track, settings)
     assert truth is not None
     assert recording.truth is not None
@@ -119,7 +119,7 @@ def _comparison(recording: Recording, track: Track, settings: Settings) -> dict[
 
 
 def _with_reading(recording: Recording, notes: list[str]) -> dict[str, Any]:
-    """What became of the log while it was read, its notes first."""
+    """Return the figures of reading the log; its notes come first."""
     report = recording.report
     return {
         "reading": {
@@ -134,7 +134,7 @@ def _with_reading(recording: Recording, notes: list[str]) -> dict[str, Any]:
 def _notes(
     recording: Recording, track: Track, found: TrackErrors | None, settings: Settings
 ) -> dict[str, Any]:
-    """The mirror pose, and what a reader is to be warned of, a sentence each."""
+    """Return the figures of the mirror pose and the rank, and notes for the reader."""
     result: dict[str, Any] = {}
     notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
     count = len(track.times)
@@ -149,7 +149,7 @@ def _notes(
         notes.append(_mirror_note(result["mirror"], count))
     rank, unknown = rank_figures(recording, track)
     result |= rank
-    # A mirror pose is warned of by its own name.
+    # If there is a mirror pose, its own note is sufficient.
     notes += unknown if "mirror" not in result else []
     volume = volume_of(recording, settings)
     if volume is not None:
@@ -166,7 +166,7 @@ def _notes(
 
 
 def _stamp_hints(recording: Recording, track: Track, settings: Settings) -> list[str]:
-    # A clock that was brought to the other's has the right unit.
+    # With a given or estimated time offset, the unit of the clock is right.
     truth = None if settings.comparison.time_offset else recording.truth
     return [*stamp_hints(track.times, truth)]
 
@@ -174,7 +174,7 @@ def _stamp_hints(recording: Recording, track: Track, settings: Settings) -> list
 def _truth_at_mirror(
     recording: Recording, track: Track, found: TrackErrors, settings: Settings
 ) -> bool:
-    """Whether the mirror pose is alive, and much nearer to the truth than the track."""
+    """Return whether the mirror pose is possible, and much nearer to the truth than the track."""
     if track.other is None:
         return False
     image = Track(track.times, *track.other[:3])
@@ -221,6 +221,6 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
 
 
 def _stride(times: FloatArray, gap_s: float) -> int:
-    """The step that leaves enough of the epochs, most of them no further apart than `gap_s`."""
+    """Return the step between epochs that keeps enough of them, with gaps of at most `gap_s`."""
     near = gap_s / float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return max(int(min(len(times) / _ENOUGH, near)), 1)

@@ -13,8 +13,8 @@ from rbl_gym.studies.replay.settings import Settings
 
 __all__ = ["covered"]
 
-# Seconds of readings that tell how the body stands; deviation of what they tell, at the least: it
-# may be moving.
+# Duration of the readings that determine roll and pitch (s), and the least standard deviation (rad)
+# of these angles, since the body may be moving.
 _LOOK_S, _TILT_RAD = 0.25, np.deg2rad(3.0)
 
 
@@ -24,14 +24,14 @@ def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> 
     Parameters
     ----------
     recording, settings
-        A log, and by how much the sensor's clock is ahead.
+        The recording, and the settings with the clock offset of the sensor.
     margin_s
-        Readings that are there beyond the epochs, seconds on both sides.
+        Required readings before the first and after the last epoch, seconds.
 
     Raises
     ------
     ValueError
-        Where there are none.
+        If no epoch has readings.
     """
     log = clocked(recording, settings)
     if log is None:

@@ -11,23 +11,23 @@ from rbl_gym.geometry import mirror, rotations
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.recordings.recording import Recording
 
-# Anchors whose distance from their plane is below this share of their width in it are tried.
+# Anchors are nearly coplanar if their distance from a plane is below this share of their width.
 _THICK = 0.5
-# A place in the plane is known once its standard deviation is below this share of the scene's
-# size; both poses start from such a share, and from such a rotation (rad).
+# The position in the plane is known if its standard deviation is below the first share of the size
+# of the scene. Both poses start with the second share, and with this rotation (rad).
 _KNOWN, _START, _START_RAD = 0.2, 0.1, 0.3
-# A rotation that no range determines stays within this (rad): no filter searches for it.
+# Limit (rad) of the standard deviation of an undetermined rotation, so that filters converge.
 _MOST_RAD = 0.45
-# A squared whitened residual counts so much and no more, whoever leaves it behind.
+# Squared whitened residuals are clipped at this value, for both poses.
 _MOST_RESIDUAL = 9.0
-# So many ranges that fit as they should are supposed to have come before.
+# Number of consistent ranges assumed before the first one.
 _PRIOR_LINKS = 10.0
-# Log odds below which a pose is given up for good, and above which it is alive (3 sigma).
+# Log odds below which a pose is excluded for good, and above which it is possible (3 sigma).
 _DEAD, _ALIVE = -30.0, -4.5
-# Log odds beyond which ranges have decided.
+# Log odds above which the ranges have decided.
 DECIDED = 12.0
-# Poses are apart from so many standard deviations on; they are one where so many epochs in a row
-# put their tags within this share of the scene's size.
+# Two poses differ if they are this many standard deviations apart. They are the same if their tags
+# are within this share of the size of the scene for this many epochs in a row.
 _APART = 3.0
 _SAME, _SAME_EPOCHS = 5e-3, 20
 
@@ -35,10 +35,10 @@ _SAME, _SAME_EPOCHS = 5e-3, 20
 class Mirror(NamedTuple):
     """The other pose after every epoch: rotation, translation (K, ...), covariance (K, 6, 6).
 
-    `log_odds` (K,) are those of the other pose against the track's by all ranges so far, whitened
-    by what the better of the two leaves of them; minus infinity where there is no other. `alive`
-    (K,): it explains the ranges as well, and the two are apart. An image that the ranges ruled
-    out in the end was alive before.
+    `log_odds` (K,) compare the other pose with the track by all ranges so far; minus infinity if
+    there is no other pose. They are scaled by the residuals of the better of the two. `alive` (K,)
+    is True if the other pose explains the ranges as well and differs from the track. An image that
+    later ranges excluded was alive before.
     """
 
     rotation: FloatArray
@@ -49,7 +49,7 @@ class Mirror(NamedTuple):
 
 
 class _Two(NamedTuple):
-    """A pose (2, ...) and its image after an epoch."""
+    """A pose and its image, arrays (2, ...), after an epoch."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -68,7 +68,7 @@ def other_pose(
     Parameters
     ----------
     recording
-        Ranges; the anchors and tags that were ever seen count.
+        The ranges; only anchors and tags with ranges are used.
     filter
         An iterated EKF with the recording's tags and motion.
     range_std
@@ -76,7 +76,7 @@ def other_pose(
     track
         Rotation, translation, covariance (K, ...) of the beliefs.
     volume
-        Corners (2, 3) of where the body may be: a pose outside is not counted.
+        Corners (2, 3) of the possible positions; a pose outside is not counted.
     """
     seen = recording.links.any(axis=0)
     measured = np.flatnonzero(seen.sum(axis=1))
@@ -100,7 +100,7 @@ def other_pose(
 
 
 def _first_known(covariance: FloatArray, normal: FloatArray, std: float) -> int | None:
-    """The first epoch whose place is known along the plane; across it, both poses are alike."""
+    """Return the first epoch with a known position in the plane, in which both poses agree."""
     along = np.linalg.svd(normal[None])[2][1:]
     variance = along @ covariance[:, 3:, 3:] @ along.T
     known = np.linalg.eigvalsh(variance)[:, -1] < std**2
@@ -117,7 +117,7 @@ def _followed(
     poses: _Two,
     same_m: float,
 ) -> Mirror | None:
-    """Both poses through all epochs from `start` on, until the image is out of the question."""
+    """Filter both poses from epoch `start` on, until the image is excluded."""
     count = len(recording.times)
     rotation, translation, covariance = (np.array(a) for a in track)
     odds_of, alive = np.full(count, -np.inf), np.zeros(count, dtype=np.bool_)
@@ -143,7 +143,7 @@ def _followed(
             return None
         if odds < _DEAD:
             break
-        # What the track stands for is the nearer of the two.
+        # The track is at the nearer of the two poses.
         off = np.linalg.norm(state.translation - track[1][k], axis=-1)
         far = int(off[1] >= off[0])
         if volume is not None and is_outside(volume, state.translation[far], state.covariance[far]):
@@ -160,7 +160,7 @@ def _followed(
 def _update(
     filter: Any, before: Any, recording: Recording, k: int, std: FloatArray | float
 ) -> tuple[Any, FloatArray, FloatArray]:
-    """Both states (2,) after epoch `k`, the log evidence of its ranges (Laplace), the cost."""
+    """Return both states (2,) after epoch `k`, their log evidence (Laplace), and their cost."""
     links, ranges = recording.links[k], recording.ranges[k]
     anchors = recording.anchors_by_epoch[k]
     told = np.where(links, std, 1.0)

@@ -13,9 +13,9 @@ from rbl_gym.studies.replay.tracking import Track
 
 __all__ = ["Observed", "observed"]
 
-# A direction of the rotation (rad) and of the place (m) is known to less than this, or is not.
+# A direction is known if its standard deviation is below this rotation (rad) or position (m).
 _KNOWN_RAD, _KNOWN_M = 0.5, 1.0
-# Tags this thin beside their length (squared) are as good as in a line.
+# Tags are collinear if the ratio of their squared thickness to squared length is below this.
 _THIN = 0.01
 
 
@@ -25,13 +25,13 @@ class Observed(NamedTuple):
     Attributes
     ----------
     turns, places
-        How many (K,) of the rotation's and of the place's three directions: standard deviation
-        below 0.5 rad and below 1 m; the place is that of the tags' centre.
+        Number (K,) of known directions of the rotation and of the position, of three each: standard
+        deviation below 0.5 rad and below 1 m. The position is that of the tag centre.
     turn_axes
-        (K, 3, 3), columns: principal axes of the rotation's error in the body frame, the best
-        known first.
+        Principal axes of the rotation error in the body frame, columns of (K, 3, 3), the best known
+        first.
     turn_std, place_std
-        (K, 3), rad and m, of the principal axes.
+        Standard deviations (K, 3) along the principal axes, rad and m.
     """
 
     turns: np.ndarray
@@ -44,7 +44,7 @@ class Observed(NamedTuple):
 def observed(track: Track, tags: FloatArray) -> Observed:
     """Return the known directions of the beliefs (K,) of a track; tags (N, 3)."""
     Q, P = track.rotation, track.covariance
-    # Of the tags' centre: v + w x Q c.
+    # Covariance at the tag centre: v + w x Q c.
     T = np.broadcast_to(np.eye(6), P.shape).copy()
     T[:, 3:, :3] = -rotations.hat(Q @ tags.mean(axis=0))
     moved = T @ P @ np.swapaxes(T, -1, -2)
@@ -84,7 +84,7 @@ def is_line(tags: FloatArray) -> bool:
 
 
 def _since(count: np.ndarray, times: FloatArray) -> float:
-    """The time from which on a count has been what it is at the end."""
+    """Return the time from which a count keeps its final value."""
     other = np.flatnonzero(count != count[-1])
     return float(times[other[-1] + 1]) if len(other) else 0.0
 

@@ -18,9 +18,9 @@ __all__ = [
     "volume_of",
 ]
 
-# Larger coordinates are map coordinates.
+# Coordinates above this value are map coordinates.
 _MAP_M = 1e4
-# Default standard deviations of a start, and of its yaw.
+# Default standard deviations of a known start, and of its yaw.
 _START_M, _START_DEG = 0.5, 30.0
 # Standard deviations of height (m), roll and pitch (rad) under the planar constraint.
 _PLANAR_STD = 1e-3
@@ -82,7 +82,7 @@ def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
     """
     known, anchors = settings.knowledge, recording.anchors_by_epoch[0]
     rotation, centre = np.eye(3), anchors.mean(axis=0)
-    # Anchors may be close together, or on one body.
+    # Anchors may be close together, for instance on one body.
     away = float(np.median(recording.ranges[recording.links]))
     extent = max(float(np.ptp(anchors, axis=0).max()), away, 1.0)
     std = np.array([math.pi] * 3 + [extent] * 3)

@@ -23,10 +23,10 @@ class ReplayedRuns(NamedTuple):
     Attributes
     ----------
     runs
-        Each, by its name.
+        Result of each run, by its name.
     figures
-        Plain numbers: ``"runs"``, the figures of each by its name, and ``"together"``, errors of
-        all epochs that have truth.
+        Plain numbers: ``"runs"``, the figures of each run by its name, and ``"together"``, the
+        errors of all epochs with truth.
     """
 
     runs: dict[str, Replayed]
@@ -95,7 +95,7 @@ def _joined(found: list[TrackErrors]) -> TrackErrors:
         return np.concatenate(known) if len(known) == len(arrays) else None
 
     freedom = np.concatenate([np.full(len(e.known), e.freedom) for e in found])
-    # NEES of runs that are judged by fewer components count as of as many.
+    # Scale the NEES of runs with fewer compared components to the same number.
     most = int(freedom.max())
     return TrackErrors(
         np.concatenate([e.known for e in found]),

@@ -88,9 +88,8 @@ class Loss:
 
     Parameters
     ----------
-    robust
-        For the iterated EKFs: False, squares; True, Huber's loss; ``"late"``, the redescending loss
-        for late ranges. None: ``"late"`` for ``"iekf-log"``, else True.
+    For the iterated EKFs: False for squares; True for Huber's loss; ``"late"`` for the redescending
+    loss for late ranges. None: ``"late"`` for ``"iekf-log"``, else True.
     """
 
     robust: bool | str | None = None
@@ -247,9 +246,8 @@ class Settings:
     filter
         Name of the filter. Options may follow it, as in ``"iekf/robust=late"``
         (`rbl_gym.estimators.parse_filter`).
-    filter_options
-        Options of the filter that the other settings do not give it, as a dict or as pairs. The
-        options after the name are added to it. `robust` is also that of `loss`.
+    Options of the filter that the other settings do not cover, as a dict or as pairs. Options after
+    the name are added to it. `robust` is the same option as in `loss`.
     range_std_m
         Standard deviation of a range; None: that of the recording if given, else
         `DEFAULT_RANGE_STD_M`, which includes link biases that change with the pose.
@@ -280,7 +278,7 @@ class Settings:
         name, options = parse_filter(self.filter, dict(self.filter_options))
         if "robust" in options:
             object.__setattr__(self, "loss", Loss(options["robust"]))
-        # Settings are keys of dicts.
+        # Settings must be hashable.
         pairs = ((key, tuple(x) if isinstance(x, list) else x) for key, x in options.items())
         object.__setattr__(self, "filter", name)
         object.__setattr__(self, "filter_options", tuple(pairs))
@@ -317,7 +315,7 @@ class Settings:
             raise ValueError(
                 f"settings have no field {unknown[0]!r}; the fields are {', '.join(known)}"
             )
-        # The options were those of the other filter.
+        # The options belong to the previous filter.
         options = dict(
             fields.get("filter_options", () if "filter" in fields else self.filter_options)
         )

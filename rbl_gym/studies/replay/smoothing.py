@@ -34,7 +34,7 @@ from rbl_gym.studies.replay.tracking import (
 
 __all__ = ["SmoothedRecording", "smooth_recording"]
 
-# If squared residuals exceed this multiple of their expectation, the start had diverged.
+# The start had diverged if squared residuals exceed this multiple of their expectation.
 _LOST = 2.0
 # Standard deviations of an unknown turn rate (rad/s) and velocity (m/s).
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
@@ -154,7 +154,7 @@ def _starts(
     """Yield start tracks, the most promising first."""
     yield track.rotation, track.translation
     if settings.filter == "iekf-imu":
-        # Neither a body at rest nor reversed time is compatible with inertial readings.
+        # A body at rest and reversed time are both incompatible with inertial readings.
         return
     times = recording.times
     moving = recording.anchors.ndim == 3

@@ -1,4 +1,4 @@
-"""Faults of a log that can be supposed: each is the log as it would be without the fault."""
+"""Suppose faults of a log: each supposition is the log as it would be without the fault."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from rbl_gym.studies.replay.place import own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M
 from rbl_gym.studies.replay.tracking import accel_of, recording_filter, robust_of
 
-# Anchors or tags beyond so many are not tried in pairs, but for the most contradicted.
+# Maximum number of anchors or tags that are tried in pairs.
 _IN_PAIRS = 12
 _UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (0.3048, "feet"))
 _WIDER = (3.0, 10.0, 30.0)
 _NOISIER = (1.5, 2.0, 3.0, 5.0, 10.0)
 _BIASES_M = (-1.0, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1.0, 2.0)
 _HEIGHTS_M = (-2.0, -1.0, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1.0, 2.0)
-# Links that are contradicted most are tried for a bias of their own.
+# Number of links, those with the largest residuals, that are tried for a bias.
 _LINKS = 4
-# A walk of zero is taken for this.
+# Walk that replaces a walk of zero.
 _LEAST_WALK_M, _LEAST_WALK_DEG = 0.03, 2.0
-# So many values are tried between two that were.
+# Number of values that are tried between two previous values.
 _STEPS = 4
-# Fewest ranges that tell a bias.
+# Fewest ranges from which a bias is estimated.
 _FEWEST = 6
-# How far an anchor may well be from where it is said to be (m), and so many ranges tell where.
+# Prior standard deviation of an anchor position (m), and number of ranges used to estimate it.
 _MOVED_M, _FIXES = 3.0, 600
 
 
 class Supposition(NamedTuple):
-    """What kind of fault, its words, the log and the settings without it, and what it fits.
+    """A fault: its kind, its description, the trial without it, and the fitted numbers.
 
-    `parameters`: how many numbers were chosen for it; that many more make any log likelier.
-    `scale`: by how much it shrinks the ranges, which makes their density larger by as much.
+    `parameters` is the number of fitted values, for which the likelihood is penalised. `scale` is
+    the factor on the ranges; smaller ranges have a larger density.
     """
 
     kind: str
@@ -51,7 +51,7 @@ class Supposition(NamedTuple):
 
 
 def first_suppositions(trial: Trial) -> Iterator[Supposition]:
-    """Faults that can be supposed at once."""
+    """Yield the faults that can be tested without previous results."""
     recording, settings = trial
     yield from _of_settings(trial)
     for kind, ids, axis in (
@@ -78,14 +78,14 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
 
 
 def left_out(trial: Trial) -> list[Trial]:
-    """The log without each of the anchors, then without each of the tags."""
+    """Return the trial without each of the anchors, then without each of the tags."""
     links = trial.recording.links
     result = []
     for axis in (1, 2):
         for k in range(links.shape[axis]):
             kept = links.copy()
             np.moveaxis(kept, axis, 0)[k] = False
-            # Without its only one nothing is left to look at.
+            # If it is the only one, keep it: no range would be left.
             kept = kept if kept.any() else links
             result.append(_with(trial, trial.recording._replace(links=kept)))
     return result
@@ -94,14 +94,14 @@ def left_out(trial: Trial) -> list[Trial]:
 def second_suppositions(
     trial: Trial, first: list[Supposition], here: Evidence, without: Evidence
 ) -> Iterator[Supposition]:
-    """Faults whose size the first runs tell.
+    """Yield the faults whose size is estimated from the first results.
 
     Parameters
     ----------
     trial, first
-        The log, and what was supposed of it.
+        The log, and the first suppositions.
     here, without
-        What came out of the log and of those suppositions, and of `left_out`.
+        Results of the log followed by those of the first suppositions, and results of `left_out`.
     """
     recording = trial.recording
     M, N = shape = recording.links.shape[1:]
@@ -116,7 +116,7 @@ def second_suppositions(
         for value in _about([*steps, scale_of_none], values) if chosen else ():
             yield make(trial, value)
     for k in range(M + N):
-        # What the poses that the others tell leave of the ranges that were left out.
+        # Residuals of the omitted ranges, at poses estimated from the others.
         poses = without.rotation[k], without.translation[k]
         what, ids = ("anchor", recording.anchor_ids) if k < M else ("tag", recording.tag_ids)
         i = k if k < M else k - M
@@ -137,7 +137,7 @@ def second_suppositions(
         mine = np.zeros(shape, np.bool_)
         mine[m, n] = True
         name = f"the ranges from anchor {recording.anchor_ids[m]} to tag {recording.tag_ids[n]}"
-        # A pose that follows the bias hides a part of it.
+        # The estimated pose absorbs a part of the bias.
         for share in (1.0, 1.4):
             yield _biased(trial, "link-bias", name, mine, share * float(middle[m, n]))
 
@@ -147,7 +147,7 @@ def _with(trial: Trial, recording: Recording) -> Trial:
 
 
 def _of_settings(trial: Trial) -> Iterator[Supposition]:
-    """Another motion, other noise, another loss."""
+    """Yield a faster motion, larger noise, and a robust loss."""
     recording, settings = trial
 
     def supposed(kind: str, text: str, **fields: float | bool) -> Supposition:
@@ -155,7 +155,7 @@ def _of_settings(trial: Trial) -> Iterator[Supposition]:
 
     motion = settings.motion
     if settings.filter == "iekf-imu":
-        pass  # what moves the body is measured
+        pass  # the sensor measures the motion
     elif getattr(recording_filter(recording, settings), "twist", None) is not None:
         accel_m, accel_deg = accel_of(settings)
         for wider in _WIDER:
@@ -191,7 +191,7 @@ def _moves(what: str, changed: dict[str, float]) -> str:
 
 
 def _most_active(recording: Recording, axis: int) -> np.ndarray:
-    """The anchors or tags that are tried in pairs."""
+    """Return the anchors or tags with the most ranges, which are tried in pairs."""
     other = tuple(k for k in range(3) if k != axis)
     ranges = recording.links.sum(axis=other)
     return np.sort(np.argsort(-ranges, kind="stable")[:_IN_PAIRS])
@@ -210,7 +210,7 @@ def _swapped(recording: Recording, i: int, j: int, axis: int) -> Recording:
 
 def _biased(trial: Trial, kind: str, name: str, mine: np.ndarray, bias: float) -> Supposition:
     recording = trial.recording
-    # A link stays a link.
+    # Keep corrected ranges positive, so that no link is lost.
     ranges = np.where(mine, np.maximum(recording.ranges - bias, 1e-3), recording.ranges)
     side = "long" if bias > 0 else "short"
     changed = recording._replace(ranges=np.where(recording.links, ranges, 0.0))
@@ -236,7 +236,7 @@ def _height(trial: Trial, step: float) -> Supposition:
 
 
 def _about(places: list[float], values: list[float]) -> FloatArray:
-    """Places between the neighbours of the one that has the highest value."""
+    """Return positions between the highest value and its neighbours."""
     order = np.argsort(places)
     x, y = np.array(places)[order], np.array(values)[order]
     best = int(np.argmax(y))
@@ -247,13 +247,13 @@ def _about(places: list[float], values: list[float]) -> FloatArray:
 
 
 def _residual(recording: Recording, rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Ranges (K, M, N) less those of poses (K, ...)."""
+    """Return the ranges (K, M, N) minus the distances at poses (K, ...)."""
     points = ranging.tag_positions(rotation, translation, recording.tags)
     return recording.ranges - ranging.distances(recording.anchors, points)
 
 
 def _moved(trial: Trial, rotation: FloatArray, translation: FloatArray, m: int) -> Supposition:
-    """The anchor where the poses that the others tell have it."""
+    """Move an anchor to where it fits the poses estimated from the others."""
     recording = trial.recording
     points = ranging.tag_positions(rotation, translation, recording.tags)
     place = recording.anchors[..., m, :]

@@ -43,9 +43,9 @@ __all__ = [
     "track_recording",
 ]
 
-# Filters with biases by the direction of the ray in their measurement model.
+# Filters that support biases by ray direction.
 _DIRECTED = ("iekf-log", "iekf-bias", "iekf-imu")
-# Factor on the covariance of the belief at the start of its mirror image.
+# Added standard deviations of rotation and position when a belief restarts from its mirror image.
 _IMAGE_RAD, _IMAGE_M = 0.1, 0.2
 
 
@@ -84,7 +84,7 @@ def track_recording(
     track = Track(recording.times, *stack_beliefs(beliefs)[:3], innovations=foretold)
     known = settings.knowledge
     if known.planar or known.height_std_m is not None or known.tilt_std_deg is not None:
-        # Height, roll and pitch are known: they distinguish the sides.
+        # Known height, roll and pitch distinguish the two sides.
         return track
     std = None
     if not has_own_std(recording, settings):
@@ -108,9 +108,9 @@ def recording_steps(
 ) -> Iterator[Step]:
     """Run a filter over the epochs of a recording, without a known start.
 
-    Standard deviations of the recording are the law of their epoch. A belief outside the volume of
-    the settings restarts from its mirror image, if that is inside. Map coordinates are taken
-    relative to the anchors; beliefs are in world coordinates.
+    Epochs with their own standard deviations use these as their noise law. A belief outside the
+    volume of the settings restarts from its mirror image, if that is inside. Map coordinates are
+    taken relative to the anchors; beliefs are in world coordinates.
     """
     origin = origin_of(recording)
     local = recording._replace(anchors=recording.anchors - origin)
@@ -247,11 +247,11 @@ def named_filter(
     else:
         process = motion.ProcessNoise(turn, walk)
     if options.get("odometry") is not None:
-        # The error of dead reckoning is given by its own law.
+        # The error of dead reckoning has its own law.
         process = motion.ProcessNoise(0.0, 0.0)
     volume = volume_of(recording, settings)
     if name == "iekf-bank" and volume is not None:
-        # The bank searches a lost body in its volume, which is finite.
+        # The bank searches a lost body in a finite volume.
         box = np.clip(volume, *reach_of(recording))
         options = {"volume": box - origin_of(recording), **options}
     if recording.offset is not None:
@@ -279,7 +279,7 @@ def _noise(settings: Settings) -> ranging.RangeNoise:
 
 # Standard deviations of an unknown turn rate (rad/s) and velocity (m/s).
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
-# Their default change in 1 s (m/s, deg/s).
+# Default change in 1 s (m/s, deg/s) with odometry.
 _TOLD = (3.0, 1000.0)
 _ACCEL = {"iekf-log": (1.0, 30.0), "iekf-cv": (0.5, 30.0)}
 

@@ -12,17 +12,17 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.truth import Truth
 
-# Epochs further apart than this are seldom a log in seconds.
+# Epochs further apart than this are rarely in seconds.
 _LONG_STEP_S = 10.0
-# A fault is named where the mean square of the errors is at least this much of what the beliefs
-# expect, and where mending it leaves less than this share of it.
+# A fault is reported if the errors exceed this multiple of their expectation (mean squares), and
+# its correction leaves less than this share of them.
 _LARGE, _EXPLAINED = 0.5, 0.25
 # A constant transform explains any error of a body at rest. For a body that moves further than the
 # error, it must explain more, or the errors must exceed this multiple of their expectation.
 _MOST_EXPLAINED, _HUGE = 0.1, 4.0
-# Of faults that explain about as much, the one named first is taken.
+# The first listed fault is preferred unless another one leaves fewer errors by this factor.
 _AS_GOOD = 1.5
-# Fewest poses that tell a fault, and the shifts of time that are tried (s).
+# Fewest poses that determine a fault, and the tested time shifts (s).
 _FEWEST = 4
 _SHIFTS = np.linspace(-3.0, 3.0, 121)
 _SI = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
@@ -33,10 +33,9 @@ def matched(
 ) -> tuple[FloatArray | None, FloatArray, BoolArray]:
     """Return truth at the epochs of a track: rotation (K, 3, 3), translation (K, 3), known (K,).
 
-    The rotation is None where the truth has none. Between two of its poses it is interpolated where
-    they are at most `gap_s` apart. A pose of the truth without such a neighbour is compared with
-    the track at its own time: it counts for the epoch that is nearest, moved there as the track
-    moves.
+    The rotation is None if the truth has none. The truth is interpolated between two poses that are
+    at most `gap_s` apart. A pose of the truth without such a neighbour is compared with the track
+    at its own time. It counts for the nearest epoch, and is moved there along the track.
     """
     turned, moved, known = recordings.truth_at(truth, times, gap_s)
     turned = None if turned is None else turned.copy()
@@ -96,13 +95,13 @@ def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
 
 
 def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
-    """Words on time stamps that look like another unit than seconds."""
+    """Yield hints on time stamps that seem to have another unit than seconds."""
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     if truth is not None and len(truth.times) > 1 and len(times) > 1:
         ratio = float(np.ptp(times) / np.ptp(truth.times))
         for name, value in (("ranges", ratio), ("truth", 1 / max(ratio, 1e-30))):
             for scale, unit in _SI:
-                # Logs of one run are about equally long.
+                # Logs of the same run are about equally long.
                 if 0.2 < value * scale < 5:
                     yield (
                         f"the stamps of the {name} look like {unit}: they span {value:.3g} times "
@@ -114,10 +113,11 @@ def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
 
 
 class Judged(NamedTuple):
-    """Estimates and truth (L, ...) at the epochs that have truth, and the beliefs' variances.
+    """Estimates and truth (L, ...) at the epochs with truth, and the variances of the beliefs.
 
-    `turn_variance`, `place_variance` (L,): traces of the rotation's and of the place's covariance.
-    Without `has_rotation`, the true rotations are those of the estimates and mean nothing.
+    `turn_variance` and `place_variance` (L,) are the traces of the rotation and position
+    covariances. Without `has_rotation`, the true rotations are those of the estimates and have no
+    meaning.
     """
 
     times: FloatArray
@@ -140,7 +140,7 @@ class Judged(NamedTuple):
         return 0.5 * float((turn / self.turn_variance + place / self.place_variance).mean())
 
     def rmse(self) -> str:
-        """The errors in words: root mean squares of the place and of the rotation."""
+        """Return the root mean square errors of position and rotation, as text."""
         turn = rotations.error(self.rotation, self.true_rotation)
         place = self.translation - self.true_translation
         turn_deg, place_m = (np.sqrt((a**2).sum(-1).mean()) for a in (np.rad2deg(turn), place))
@@ -152,18 +152,19 @@ def fault_hints(
 ) -> list[str]:
     """Return at most two constant faults of the truth that explain most of the errors.
 
-    Tried: the order and the direction of the quaternions, the unit of the places, a shift of
-    time, and, alone or on top of these, a rigid transform of the world frame or of the body frame.
+    Tested are the order and the direction of the quaternions, the unit of the positions, a time
+    shift, and, alone or in addition, a rigid transform of the world frame or of the body frame.
 
     Parameters
     ----------
     at
-        What is judged, with the truth's rotations as they are in the file, its stamps taken to be
-        late by so many seconds; of all epochs, or without rotations and of some.
+        Function of a delay in seconds, by which the time stamps of the truth are corrected, and a
+        flag. It returns what is compared: with the rotations of the file at all epochs, or without
+        rotations at some epochs.
     seen
-        Rotations (L, 3, 3) of the file as they are judged.
+        Function that converts rotations (L, 3, 3) of the file to those that are compared.
     planar
-        The place is of x and y alone.
+        Whether the position has only x and y.
     """
 
     def mended(judged: Judged) -> Judged:
@@ -181,7 +182,8 @@ def fault_hints(
     hints: list[str] = []
     while judged.excess() >= _LARGE and len(hints) < 2:
         best: tuple[float, str, Judged] | None = None
-        # A frame comes alone, or on top of another fault: neither explains much without the other.
+        # A frame may be wrong alone or together with another fault, where neither explains the
+        # errors.
         most = _EXPLAINED * judged.excess()
         tried = [(text, other, most) for text, other in faults]
         for text, other in (("", judged), *faults):
@@ -202,7 +204,7 @@ def fault_hints(
 
 
 def _share_of_frames(judged: Judged) -> float:
-    """The share of the mean square that a constant transform may leave to be named."""
+    """Return the share of the mean square errors below which a constant transform is reported."""
     if judged.excess() >= _HUGE:
         return _EXPLAINED
     place = judged.true_translation
@@ -212,7 +214,7 @@ def _share_of_frames(judged: Judged) -> float:
 
 
 def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
-    """Quaternions in another order, rotations the other way, places in another unit."""
+    """Yield quaternions in another order, inverted rotations, positions in another unit."""
     Q = judged.true_rotation
     q = rotations.quaternion(Q)
     for text, other in (
@@ -237,14 +239,14 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
     spread = [np.ptp(a, axis=0).max() for a in (judged.translation, judged.true_translation)]
     for scale, unit in ((0.01, "centimetres"), (0.001, "millimetres")):
         moved = scale * judged.true_translation
-        # A path that shrinks to a point fits everywhere.
+        # A path that shrinks to a point fits any track.
         if scale * spread[1] < 0.3 * spread[0]:
             continue
         yield f"the truth's positions look like {unit}", judged._replace(true_translation=moved)
 
 
 def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
-    """The shift of time that leaves least, by the places."""
+    """Yield the time shift with the smallest position errors, if it is not about zero."""
     best: tuple[float, float] | None = None
     for shift in _SHIFTS:
         other = at(shift, False)
@@ -263,14 +265,14 @@ def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
 
 
 def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
-    """The rigid transforms of the world and of the body that leave least."""
+    """Yield the rigid transforms of the world and of the body with the smallest errors."""
     p, q, Q = judged.translation, judged.true_translation, judged.true_rotation
-    # Beliefs of the start, which are wide, count for less.
+    # Beliefs at the start, which are uncertain, have less weight.
     w, u = (1 / np.maximum(a, np.median(a)) for a in (judged.place_variance, judged.turn_variance))
     w, u = w / w.sum(), u / u.sum()
     spread = [a - w @ a for a in (p, q)]
     turns = np.einsum("k,kij,klj->il", u, judged.rotation, Q) * judged.has_rotation
-    # How much a path tells of a turn, against the rotations: nothing where it goes nowhere.
+    # Weight of the path relative to the rotations; a path that does not move has none.
     trust = np.median(judged.turn_variance) / np.median(judged.place_variance)
     R = rotations.nearest(turns + trust * np.einsum("k,ki,kj->ij", w, *spread))
     shift = w @ (p - q @ R.T)
@@ -305,9 +307,9 @@ def judged_of(
     planar: bool,
     counts: BoolArray,
 ) -> Judged:
-    """What `fault_hints` reads, of a truth at the epochs of a track that count (K,).
+    """Return the input of `fault_hints` for a truth at the counted epochs (K,) of a track.
 
-    Planar: place in x and y.
+    Planar: only x and y of the position are compared.
     """
     rotation, translation, known = truth
     known = known & counts
