@@ -48,12 +48,12 @@ class Reading(NamedTuple):
     ranges, anchors
         Ranges (..., M, N) in metres and anchor positions (..., M, 3).
     links
-        (..., M, N), True where a range was measured; None: all.
+        Mask (..., M, N), True if a range was measured; None: all.
     noise
         Noise law of this epoch; None: that of the filter.
     twist
-        (..., 6), rad/s and m/s, of the interval that ends at this epoch; None: no interval, as at
-        the first epoch.
+        Twist (..., 6), rad/s and m/s, of the interval that ends at this epoch; None: no interval,
+        as at the first epoch.
     dt
         Length of that interval, seconds.
     inertial
@@ -138,7 +138,7 @@ def track_epochs(
 
 
 def _updated(filter: Filter, state: Any, reading: Reading) -> Any:
-    # A filter without support for a law per epoch has no such argument.
+    # A filter without support for a noise law per epoch has no such argument.
     law = {} if reading.noise is None else {"noise": reading.noise}
     return filter.update(state, reading.ranges, reading.anchors, reading.links, **law)
 

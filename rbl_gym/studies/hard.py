@@ -30,13 +30,13 @@ FILTERS = ("iekf", "iekf/robust=true", "iekf-bank/robust=true")
 START_SCENES = ("uwb_room", "drone_yard", "satellite", "auv_buoys")
 STARTS = ("wrong", "nothing", "outage", "wrong, 10 % NLOS")
 START_FILTERS = ("iekf", "iekf-bank")
-# If coplanar anchors leave a mirror pose, also a bank that knows the side: the option `volume` with
-# the limits of the scene.
+# For coplanar anchors, which leave a mirror pose, a bank that knows the side: the option `volume`
+# is set to the limits of the scene.
 _WITH_VOLUME = "iekf-bank, volume"
 _COPLANAR = ("auv_buoys",)
-# An error whose square, normalised by the bound, exceeds this is not random (mean 6).
+# An error whose square, normalised by the bound, exceeds this value is not random (mean 6).
 LOST = 100.0
-# Epochs of the wrong starts; the outage's links and odometry are gone for `_GONE` of them.
+# Epochs after a start, and epochs of an outage without links and odometry.
 _START_STEPS, _GONE = 20, range(5, 50)
 _WRONG_RAD, _WRONG_M = np.pi, 10.0
 # Epochs after a wrong start, or after an outage, at which recovery is evaluated.
@@ -60,13 +60,13 @@ def compare_hard_conditions(trials: int, seed: int, advance: Advance = silent) -
 
     Returns
     -------
-    A dict of plain numbers. ``links[scene][condition]``: `share_good`, of links that measured on
-    a direct path; `filters`, each with its RMSE over two posterior Cramer-Rao bounds, averaged
-    over the epochs (``clean``: all links on direct paths; ``good``: the available direct
-    ones), NEES, the largest errors, `lost` (share of trials with an error of more than
-    `LOST` in the covariance of the bound at the end, or ever), microseconds per step.
-    ``starts[scene][start][filter]``: share of the trials that have recovered `AFTER` these numbers
-    of epochs.
+    A dict of plain numbers. ``links[scene][condition]`` has `share_good`, the share of links with a
+    range on the direct path, and `filters`. Each filter has its RMSE relative to two posterior
+    Cramer-Rao bounds, averaged over the epochs (``clean``: all links on direct paths; ``good``:
+    only the available direct ones), NEES, the largest errors, `lost` (share of trials with a
+    normalised squared error above `LOST`, at the end or ever), and microseconds per step.
+    ``starts[scene][start][filter]`` is the share of recovered trials, by number of epochs
+    (`AFTER`).
     """
     result: dict[str, Any] = {"experiment": "hard", "trials": trials, "seed": seed}
     links = len(LINK_SCENES) * len(CONDITIONS) * len(FILTERS)
@@ -95,7 +95,7 @@ def compare_hard_conditions(trials: int, seed: int, advance: Advance = silent) -
 
 
 def _links(scene: Scene, count: int, rng: np.random.Generator, advance: Advance) -> dict[str, Any]:
-    """Run all filters on the same episodes of one scene and condition."""
+    """Run all filters on the same episodes of one scene, under each condition."""
     trials = monte_carlo.simulate_trials(scene, count, rng)
     good = np.array([m.links & ~m.nlos for m in trials.measurements])
     clean = monte_carlo.bound_of(scene, trials.episode, np.ones_like(good))
@@ -121,7 +121,7 @@ def _links(scene: Scene, count: int, rng: np.random.Generator, advance: Advance)
 
 
 def _ratios(error: FloatArray, bound: FloatArray) -> dict[str, float]:
-    """Return RMSE over that of the bound, averaged over epochs: rotation and translation."""
+    """Return the RMSE over that of the bound, averaged over epochs: rotation and translation."""
     variance = np.diagonal(bound, axis1=-2, axis2=-1).mean(axis=1)
     square = np.square(error).mean(axis=1)
     return {
@@ -138,7 +138,7 @@ def _squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Case:
-    """Run episodes with wrong or no start information, or with an outage."""
+    """Return episodes with a wrong start, without start information, or with an outage."""
     links = {"nlos_probability": 0.1} if "NLOS" in start else {}
     back = _GONE.stop if start == "outage" else 0
     scene = scenes.get({"name": name, "links": links, "steps": back + _START_STEPS})

@@ -1,1 +1,1 @@
-"""Floor plans: drawings (DXF, GeoJSON) and pictures read to the tables of a building file."""
+"""Read floor plans: drawings (DXF, GeoJSON) and pictures become tables of a building file."""

@@ -1,4 +1,4 @@
-"""A drawing as shapes on named layers, in metres, with its units and the entities not read."""
+"""Represent a drawing: shapes on named layers in metres, its units, and skipped entities."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Shape(NamedTuple):
     layer, kind
         Name of the layer; kind of the entity in the file.
     points
-        (n, 2), metres. One point is a mark. A ring does not repeat its first point.
+        Points (n, 2), metres. One point is a mark. A ring does not repeat its first point.
     closed
         Whether it is a ring.
     holes
@@ -63,7 +63,7 @@ class Drawing(NamedTuple):
     zero
         The point of the file, in its own units, that is (0, 0) of the shapes.
     shapes, labels
-        In the order of the file.
+        Shapes and texts in the order of the file.
     unread
         For each layer, the number of entities of each kind that were not read.
     said

@@ -1,4 +1,4 @@
-"""DXF read to shapes, by ezdxf (extra ``placement``): blocks exploded, arcs as short lines."""
+"""Read DXF files with ezdxf (extra ``placement``): blocks are exploded, arcs become short lines."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.polygons import area, contains
 from rbl_gym.placement.plans.drawing import UNITS, Drawing, Label, Shape, scaled
 
-# $INSUNITS of a header, as far as buildings are drawn in them.
+# Values of $INSUNITS in the header, for the units of buildings.
 _INSUNITS = {1: "in", 2: "ft", 4: "mm", 5: "cm", 6: "m", 7: "km"}
-# Distance of an arc from the lines that replace it, metres.
+# Maximum distance of an arc from the lines that replace it, metres.
 _FLATTENING_M = 0.02
-# What ezdxf makes a path of; all else is counted.
+# Entities that ezdxf converts to paths; all others are counted as unread.
 _PATHS = {"LINE", "LWPOLYLINE", "POLYLINE", "CIRCLE", "ARC", "ELLIPSE", "SPLINE", "SOLID", "TRACE",
           "3DFACE"}  # fmt: skip
 _TEXTS = {"TEXT", "MTEXT"}
-# Blocks in blocks deeper than this are not followed.
+# Maximum depth of nested blocks.
 _DEPTH = 16
 
 
 def read_dxf(path: str, units: str | None, zero: tuple[float, float] | None) -> Drawing:
-    """Shapes of the model space. Arguments and errors as `reading.read_drawing`."""
+    """Return the shapes of the model space. Arguments and errors as in `reading.read_drawing`."""
     document = _open(path)
     code = int(document.header.get("$INSUNITS", 0))
     named = _INSUNITS.get(code)
@@ -61,7 +61,7 @@ def read_dxf(path: str, units: str | None, zero: tuple[float, float] | None) -> 
 
 
 class _Found:
-    """Shapes, labels and what could not be read, gathered over a drawing and its blocks."""
+    """Collect shapes, labels and unread entities of a drawing and its blocks."""
 
     def __init__(self, distance: float) -> None:
         self.distance = distance
@@ -75,7 +75,7 @@ class _Found:
         try:
             shapes = list(self.shapes_of(entity, kind, layer, depth))
         except (TypeError, ValueError, ArithmeticError, LookupError, AttributeError):
-            # A broken entity, of which ezdxf makes nothing.
+            # ezdxf cannot read a damaged entity.
             shapes = None
         if shapes is None:
             self.unread.setdefault(layer, Counter())[kind] += 1
@@ -113,7 +113,7 @@ class _Found:
             raise TypeError(kind)
 
     def explode(self, insert: Any, layer: str, depth: int) -> None:
-        """What a block holds, on the layers it has; on layer 0: on the layer of the insert."""
+        """Add the content of a block; shapes on layer 0 go to the layer of the insert."""
         block = insert.block()
         if block is None or depth >= _DEPTH:
             raise ValueError("no block")
@@ -135,7 +135,7 @@ class _Found:
         self.unread.setdefault(layer, Counter())[entity.dxftype()] += 1
 
     def flat(self, path: Any) -> tuple[FloatArray | None, bool]:
-        """A path seen from above, (n, 2), and whether it is a ring; None: it has no extent."""
+        """Return a path in plan, (n, 2), and whether it is a ring; None for a single point."""
         points = np.array([point.vec2 for point in path.flattening(self.distance, 2)])
         if len(points) < 2:
             return None, False
@@ -148,7 +148,10 @@ class _Found:
 
 
 def _with_holes(rings: list[FloatArray], layer: str, kind: str) -> Iterator[Shape]:
-    """Rings of a hatch: each that lies inside an odd number of others is a hole of the least."""
+    """Yield the shapes of a hatch, with their holes.
+
+    A ring inside an odd number of others is a hole of the smallest of them.
+    """
     inside = [
         [k for k, other in enumerate(rings) if k != j and contains(other, ring[:1])[0]]
         for j, ring in enumerate(rings)
@@ -177,7 +180,7 @@ def _middle(entity: Any, kind: str) -> FloatArray:
 
 
 def _open(path: str) -> Any:
-    """The document; a damaged one is mended as far as it can be."""
+    """Open the document; a damaged one is repaired if possible."""
     try:
         from ezdxf import recover
         from ezdxf.filemanagement import readfile
@@ -202,7 +205,7 @@ def _open(path: str) -> Any:
 
 
 def _rough_size(model: Any) -> str:
-    """The size in units, for an error message."""
+    """Return the size in units, for an error message."""
     from ezdxf import bbox
 
     box = bbox.extents(model, fast=True)

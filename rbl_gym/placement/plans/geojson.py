@@ -1,4 +1,4 @@
-"""GeoJSON read to shapes: lengths as they are, degrees projected to a local tangent plane."""
+"""Read GeoJSON: lengths are kept, degrees are projected to a local tangent plane."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.plans.drawing import Drawing, Shape, scaled
 
-# WGS 84: half axis (m) and squared eccentricity.
+# WGS 84: semi-major axis (m) and squared eccentricity.
 _A, _E2 = 6_378_137.0, 6.694379990141316e-3
-# A plan in metres is wider than this; one in degrees is narrower (11 km).
+# A plan in metres is larger than this value, one in degrees is smaller (11 km).
 _WIDEST_DEG = 0.1
 _LAYER_NAMES = ("layer", "kind", "class")
 _DEGREES = ("4326", "CRS84", "4979")
@@ -24,7 +24,7 @@ _DEGREES = ("4326", "CRS84", "4979")
 def read_geojson(
     path: str, units: str | None, zero: tuple[float, float] | None, layer_property: str | None
 ) -> Drawing:
-    """Shapes of all features. Arguments and errors as `reading.read_drawing`."""
+    """Return the shapes of all features. Arguments and errors as in `reading.read_drawing`."""
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -51,7 +51,7 @@ def read_geojson(
 
 
 def _check_not_degrees(data: Any, drawing: Drawing) -> None:
-    """Longitudes and latitudes are no lengths: a ValueError says what to do."""
+    """Raise ValueError if the coordinates are longitudes and latitudes read as lengths."""
     low, high = drawing.bounds()
     named = any(code in json.dumps(data.get("crs", "")) for code in _DEGREES)
     small = np.abs([low, high]).max() <= 180 and (high - low).max() < _WIDEST_DEG
@@ -64,7 +64,7 @@ def _check_not_degrees(data: Any, drawing: Drawing) -> None:
 
 
 def _features(data: Any, path: str) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Geometry and properties of each feature."""
+    """Yield geometry and properties of each feature."""
     if not isinstance(data, dict) or "type" not in data:
         raise ValueError(f"{path}: not a GeoJSON file: it has no 'type' at its top level")
     if data["type"] == "FeatureCollection":
@@ -81,7 +81,7 @@ def _features(data: Any, path: str) -> Iterator[tuple[Any, dict[str, Any]]]:
 
 
 def _parts(geometry: Any) -> Iterator[tuple[Any, Any]]:
-    """Kind and coordinates of each simple part of a geometry."""
+    """Yield kind and coordinates of each simple part of a geometry."""
     if not isinstance(geometry, dict):
         yield "none", None
         return
@@ -99,7 +99,7 @@ def _parts(geometry: Any) -> Iterator[tuple[Any, Any]]:
 def _shape(
     layer: str, kind: Any, coordinates: Any, properties: dict[str, Any], name: str
 ) -> list[Shape] | None:
-    """The shape of one part; None where its kind holds no line."""
+    """Return the shapes of one part; None if its kind has no lines or points."""
     if kind not in ("Point", "LineString", "Polygon"):
         return None
     if kind == "Point":
@@ -144,22 +144,23 @@ def _projected(drawing: Drawing, zero: tuple[float, float] | None) -> Drawing:
         )
         for shape in drawing.shapes
     ]
-    # Their size is checked as that of any drawing in metres.
+    # Check the size as for any drawing in metres.
     checked = scaled(drawing._replace(units="m", shapes=metres), (0.0, 0.0))
     said = f"x is east and y is north of longitude {zero[0]:.9g}, latitude {zero[1]:.9g}"
     return checked._replace(units="degrees", zero=zero, said=[said, *checked.said])
 
 
 def from_degrees(points: FloatArray, zero: tuple[float, float]) -> FloatArray:
-    """Longitudes and latitudes (..., 2), degrees, as metres east and north of `zero`.
+    """Return longitudes and latitudes (..., 2), degrees, as metres east and north of `zero`.
 
-    The tangent plane of the WGS 84 ellipsoid at `zero` (longitude, latitude), heights left out.
+    The plane is tangent to the WGS 84 ellipsoid at `zero` (longitude, latitude). Heights are
+    ignored.
     """
     return (_ecef(points) - _ecef(np.array(zero))) @ _axes(zero).T
 
 
 def to_degrees(points: FloatArray, zero: tuple[float, float]) -> FloatArray:
-    """The inverse of `from_degrees`: (..., 2) metres to longitudes and latitudes, by Newton."""
+    """Return longitudes and latitudes of metres (..., 2): `from_degrees` inverted by Newton."""
     found = np.broadcast_to(np.array(zero, float), points.shape).copy()
     step = 1e-4
     for _ in range(4):
@@ -174,7 +175,7 @@ def to_degrees(points: FloatArray, zero: tuple[float, float]) -> FloatArray:
 
 
 def _ecef(degrees: FloatArray) -> FloatArray:
-    """Longitude and latitude on the ellipsoid as earth-fixed metres (..., 3)."""
+    """Return earth-fixed coordinates (..., 3), metres, of longitudes and latitudes."""
     lon, lat = np.moveaxis(np.deg2rad(degrees), -1, 0)
     normal = _A / np.sqrt(1 - _E2 * np.sin(lat) ** 2)
     return np.stack(
@@ -188,7 +189,7 @@ def _ecef(degrees: FloatArray) -> FloatArray:
 
 
 def _axes(zero: tuple[float, float]) -> FloatArray:
-    """East and north (2, 3) at a longitude and latitude."""
+    """Return the directions east and north (2, 3) at a longitude and latitude."""
     lon, lat = np.deg2rad(zero)
     return np.array(
         [

@@ -1,4 +1,4 @@
-"""Layers of a drawing mapped to the tables of a building file: walls, obstacles, zones, mounts."""
+"""Convert layers of a drawing to tables of a building file: walls, obstacles, zones, mounts."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from rbl_gym.placement.plans.uses import KEYS, KINDS, MATERIALS, TEXTS, Use, num
 
 __all__ = ["Building", "building"]
 
-# Heights that are taken where nothing says any, metres.
+# Default heights, metres.
 ZONE_M, _MOUNT_LOW_M, _BELOW_CEILING_M = (0.5, 2.0), 2.0, 0.2
-# What other programs call the keys.
+# Names of the keys in other programs.
 _PROPERTIES = {
     "height": "high_m",
     "min_height": "low_m",
@@ -36,7 +36,7 @@ _PROPERTIES = {
 }
 
 
-# What a plan does not tell.
+# Defaults for values that a plan does not contain.
 DEVICES: dict[str, Any] = {
     "body": {"shape": "octahedron", "size_m": 0.8},
     "noise": {"floor_m": 0.1, "proportional": 0.0},
@@ -44,9 +44,9 @@ DEVICES: dict[str, Any] = {
 
 
 class Building(NamedTuple):
-    """Tables of a building file, and what a reader should know of how they came about.
+    """Tables of a building file, and notes on how they were made.
 
-    A table may have the key ``#``: a comment of the file.
+    The key ``#`` of a table is a comment in the file.
     """
 
     tables: dict[str, Any]
@@ -57,24 +57,26 @@ class Building(NamedTuple):
 def building(
     drawing: Drawing, uses: Iterable[Use] = (), height_m: float = 3.0, n_anchors: int = 8
 ) -> Building:
-    """The tables of a building file, of the layers of a drawing.
+    """Return the tables of a building file for the layers of a drawing.
 
     Parameters
     ----------
     drawing
-        From `reading.read_drawing`.
+        Drawing from `reading.read_drawing`.
     uses
-        What layers are taken for; of several for one layer and kind, the first. None at all:
-        layers that are called as `KINDS`, in any case, with or without the last letter.
+        Uses of the layers; for several of the same layer and kind, the first counts. If empty,
+        layers are used by their names, which must be in `KINDS`, in upper or lower case, singular
+        or plural.
     height_m
-        From the floor to the ceiling: of walls, obstacles and mounts that say nothing else.
+        Height of the ceiling above the floor, metres, for walls, obstacles and mounts without their
+        own height.
     n_anchors
-        How many anchors are to be placed.
+        Number of anchors to place.
 
     Raises
     ------
     ValueError
-        On a layer that there is not, and on a material without a share of information.
+        If a layer does not exist, or a material has no known information fraction.
     """
     uses = list(uses)
     made = _Maker(drawing, height_m)
@@ -86,7 +88,7 @@ def building(
                 f"{', '.join(map(repr, drawing.layers()))}"
             )
         for layer in layers:
-            # The first that matches: LAYER before A-*.
+            # The first match counts, so that a name can precede a pattern such as A-*.
             if use.kind not in made.used.get(layer, []):
                 made.take(layer, use)
     if not made.used:
@@ -103,7 +105,7 @@ def _matches(name: str, pattern: str) -> bool:
 
 
 def _by_name(drawing: Drawing) -> list[Use]:
-    """Layers called wall, walls, WALLS, zone, ..."""
+    """Return uses by layer name: wall, walls, WALLS, zone, ..."""
     return [
         Use(kind, layer, {})
         for kind in KINDS
@@ -113,7 +115,7 @@ def _by_name(drawing: Drawing) -> list[Use]:
 
 
 class _Maker:
-    """The tables so far."""
+    """Collects the tables."""
 
     def __init__(self, drawing: Drawing, height_m: float) -> None:
         self.drawing = drawing
@@ -123,7 +125,7 @@ class _Maker:
         self.said: list[str] = []
 
     def take(self, layer: str, use: Use) -> None:
-        """The entries of one layer, of one kind."""
+        """Add the entries of one layer for one kind of use."""
         shapes = [shape for shape in self.drawing.shapes if shape.layer == layer]
         lines, marks = lines_of(shapes)
         entries, left = getattr(self, f"_{use.kind}")(lines, marks, layer, use)
@@ -133,7 +135,7 @@ class _Maker:
             if count:
                 self.said.append(f"layer {layer}, read as {use.kind}: {count} {what}")
 
-    # --- kinds: entries, and (count, what) of shapes that were left out --------------------------
+    # --- kinds: entries, and (count, what) of skipped shapes -------------------------------------
 
     def _walls(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
         widest = use.values.get("side_by_side_m")
@@ -157,7 +159,7 @@ class _Maker:
         ]
 
     def _centred(self, lines: list[Shape], use: Use, widest: float) -> Any:
-        """Walls drawn as two lines each: their centre lines, and the lines that have no twin."""
+        """Return walls drawn as two lines: their centre lines, and the lines without a partner."""
         rings = [(ring, shape.closed) for shape in lines for ring in (shape.points, *shape.holes)]
         centred, single = centre_lines(rings, widest)
         values = self._values(None, use, KEYS["walls"], {"low_m": 0.0, "high_m": self.height})
@@ -255,7 +257,7 @@ class _Maker:
     def _values(
         self, shape: Shape | None, use: Use, keys: Iterable[str], usual: dict[str, Any]
     ) -> dict[str, Any]:
-        """Keys of an entry: what the shape says goes before the layer's, that before the usual."""
+        """Return the values of an entry: of the shape, else of the layer, else the defaults."""
         said = {}
         for key, value in ({} if shape is None else shape.properties).items():
             key = _PROPERTIES.get(key, key)
@@ -280,7 +282,7 @@ class _Maker:
     # --- the whole -------------------------------------------------------------------------------
 
     def complete(self) -> None:
-        """Mounts and a zone where no layer is one."""
+        """Add default mounts and a default zone if no layer has them."""
         top = rounded(self.height - _BELOW_CEILING_M)
         if not self.found["mounts"]:
             low = min(_MOUNT_LOW_M, 0.7 * self.height)
@@ -328,7 +330,7 @@ class _Maker:
             taken.add(zone["name"])
 
     def _outline(self) -> list[list[float]]:
-        """The rectangle around what is used."""
+        """Return the bounding rectangle of the used layers."""
         low, high = self.drawing._replace(
             shapes=[s for s in self.drawing.shapes if s.layer in self.used or not self.used]
         ).bounds()
@@ -367,5 +369,5 @@ class _Maker:
 
 
 def _commented(rows: list[dict[str, Any]], layer: str) -> list[dict[str, Any]]:
-    """The first entry of a layer names it."""
+    """Return the rows of a layer; a comment on the first names the layer."""
     return [{"#": f"layer {layer}", **row} if k == 0 else row for k, row in enumerate(rows)]

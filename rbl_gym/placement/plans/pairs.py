@@ -1,4 +1,4 @@
-"""Walls drawn as two lines: their centre lines."""
+"""Find the centre lines of walls that are drawn as two lines."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 
-# Lines are parallel within this (sine of an angle); an overlap shorter than this share of the
-# distance between two lines is no wall.
+# Two lines are parallel within this sine of their angle. Their overlap must be longer than this
+# multiple of their distance.
 _PARALLEL, _LEAST_OVERLAP = 0.02, 1.0
 Piece = tuple[float, float]
 
@@ -15,21 +15,21 @@ Piece = tuple[float, float]
 def centre_lines(
     lines: list[tuple[FloatArray, bool]], widest: float
 ) -> tuple[list[tuple[FloatArray, float]], list[FloatArray]]:
-    """Centre lines of pairs of parallel segments, and the segments that have no twin.
+    """Return centre lines of pairs of parallel segments, and the segments without a partner.
 
     Parameters
     ----------
     lines
-        Points (n, 2), metres, and whether they are a ring.
+        Points (n, 2) of each line, metres, and whether it is a ring.
     widest
-        Two segments further apart than this are two walls, metres.
+        Maximum distance of the two lines of a wall, metres.
 
     Returns
     -------
     pairs, single
-        Centre lines (2, 2) with the distance of the two, the closest pairs first; segments (2, 2)
-        without twin. What is left of a segment and shorter than `widest`, such as the end of a
-        wall, is dropped.
+        Centre lines (2, 2) with the distance of their two lines, the closest pairs first; and
+        segments (2, 2) without a partner. Remaining pieces shorter than `widest`, such as the end
+        of a wall, are dropped.
     """
     segments = np.concatenate(
         [
@@ -54,7 +54,7 @@ def centre_lines(
     free: list[list[Piece]] = [[(0.0, float(x))] for x in length]
     pairs = []
     for distance, i, j in sorted(found):
-        # Places along segment i, of what is free of both.
+        # Intervals along segment i that are free on both segments.
         sign = 1.0 if along[i] @ along[j] > 0 else -1.0
         shift = float((start[j] - start[i]) @ along[i])
         other = [tuple(sorted((shift + sign * a, shift + sign * b))) for a, b in free[j]]
@@ -65,7 +65,8 @@ def centre_lines(
             if min(b, d) - max(a, c) > _LEAST_OVERLAP * distance
         ]
         for low, high in common:
-            # Where one of the two goes on, the wall turns a corner: up to the middle of it.
+            # If one of the two lines continues, the wall turns a corner: extend it to the middle of
+            # the corner.
             reach = 0.5 * distance
             first = low - reach * _goes_on(free[i], other, low - reach)
             last = high + reach * _goes_on(free[i], other, high + reach)

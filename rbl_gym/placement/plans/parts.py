@@ -1,4 +1,4 @@
-"""Shapes of a layer as lists of numbers: lines joined, places of marks, holes cut open."""
+"""Convert the shapes of a layer to lists of numbers: lines, positions of marks, outlines."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from rbl_gym.placement.plans.drawing import Shape
 from rbl_gym.placement.plans.rings import joined, opened
 from rbl_gym.placement.plans.uses import Use, number
 
-# Ends of lines this close belong together, metres.
+# Line ends within this distance are joined, metres.
 _TOLERANCE_M = 0.01
 
 
 def rectangle(low: FloatArray, high: FloatArray) -> list[list[float]]:
-    """Corners of a rectangle, counter-clockwise."""
+    """Return the corners of a rectangle, counter-clockwise."""
     return points_of(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))
 
 
 def lines_of(shapes: list[Shape]) -> tuple[list[Shape], list[Shape]]:
-    """Lines and rings, loose lines joined where they meet; and marks."""
+    """Return lines and rings, where loose lines with common ends are joined, and marks."""
     marks = [shape for shape in shapes if len(shape.points) == 1]
     rings = [shape for shape in shapes if shape.closed]
     loose = [shape for shape in shapes if not shape.closed and len(shape.points) > 1]
@@ -31,7 +31,7 @@ def lines_of(shapes: list[Shape]) -> tuple[list[Shape], list[Shape]]:
 
 
 def spots_of(marks: list[Shape], lines: list[Shape], use: Use) -> list[list[float]]:
-    """Places (x, y, z) of marks, or, where there are none, of the middles of rings."""
+    """Return positions (x, y, z) of marks or, if there are none, of the centres of rings."""
     rings = [
         shape._replace(points=shape.points.mean(axis=0)[None]) for shape in lines if shape.closed
     ]
@@ -44,21 +44,21 @@ def spots_of(marks: list[Shape], lines: list[Shape], use: Use) -> list[list[floa
 
 
 def outline_of(shape: Shape) -> FloatArray:
-    """A ring with its holes cut open, as far as they can be."""
+    """Return a ring with its holes connected to it, as far as possible."""
     ring = opened(shape.points, shape.holes) if shape.holes else shape.points
     return shape.points if ring is None else ring
 
 
 def count_blocks(marks: list[Shape]) -> int:
-    """How many marks are those of blocks."""
+    """Return the number of marks from blocks."""
     return sum(mark.kind == "INSERT" for mark in marks)
 
 
 def points_of(points: FloatArray) -> list[list[float]]:
-    """Points (n, 2) as lists."""
+    """Return points (n, 2) as lists."""
     return [[rounded(x) for x in point] for point in points.tolist()]
 
 
 def rounded(value: float) -> float:
-    """To a tenth of a millimetre; no minus zero."""
+    """Round to a tenth of a millimetre, without minus zero."""
     return round(float(value), 4) + 0.0

@@ -1,4 +1,4 @@
-"""A picture of a floor plan: its size in metres, and a building file that begins with it."""
+"""Read a picture of a floor plan: its size in metres, and a first building file for it."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["backdrop", "of_picture"]
 def backdrop(
     path: str, metres_per_pixel: float, origin: tuple[float, float] = (0.0, 0.0)
 ) -> dict[str, Any]:
-    """The table [plan] of a picture.
+    """Return the table [plan] of a picture.
 
     Parameters
     ----------
     path
-        PNG or JPEG.
+        Path of a PNG or JPEG file.
     metres_per_pixel
-        Its scale.
+        Scale of the picture.
     origin
-        Where its lower left corner is, metres.
+        Position of the lower left corner, metres.
 
     Raises
     ------
     ValueError
-        Naming the file, where it is no picture.
+        If the file is not a picture; the message names it.
     """
     pixels(path)
     if not 0 < metres_per_pixel < np.inf:
@@ -39,17 +39,17 @@ def backdrop(
 
 
 def of_picture(plan: dict[str, Any], height_m: float = 3.0, n_anchors: int = 8) -> Building:
-    """Tables of a building file of which only the picture is known.
+    """Return tables of a building file when only the picture is known, to be edited.
 
-    The rectangle of the picture without its margins is one zone, and anchors may stand on the
-    ceiling above it: to be edited.
+    The rectangle of the picture without its margins is one zone. Anchors may be on the ceiling
+    above it.
 
     Parameters
     ----------
     plan
-        From `backdrop`.
+        Table from `backdrop`.
     height_m, n_anchors
-        As `layers.building`.
+        As in `layers.building`.
     """
     path, metres_per_pixel = plan["image"], plan["metres_per_pixel"]
     low = np.array(plan["origin"])
@@ -90,7 +90,7 @@ def of_picture(plan: dict[str, Any], height_m: float = 3.0, n_anchors: int = 8) 
 
 
 def pixels(path: str) -> tuple[int, int]:
-    """Width and height."""
+    """Return width and height in pixels."""
     from PIL import Image, UnidentifiedImageError
 
     with Path(path).open("rb") as file:

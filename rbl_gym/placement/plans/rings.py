@@ -1,4 +1,4 @@
-"""Rings and lines of a plan: lines joined to longer ones, holes cut open."""
+"""Join lines of a plan to longer ones, and connect holes to their outlines."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.polygons import area
 
-# A hole is joined to its outline by a slit so wide, metres.
+# Width of the slit that connects a hole to its outline, metres.
 _SLIT_M = 0.001
 
 
 def joined(lines: list[FloatArray], tolerance: float) -> list[tuple[FloatArray, bool]]:
-    """Lines (n, 2) joined where exactly two of them end at one place.
+    """Join lines (n, 2) at points where exactly two of them end.
 
-    Returns lines and whether each is a ring, which does not repeat its first point. Ends count
-    as one place within `tolerance`, metres.
+    Return the lines, and whether each is a ring, which does not repeat its first point. Ends within
+    `tolerance` (metres) are the same point.
     """
     ends = np.array([line[k] for line in lines for k in (0, -1)]).reshape(-1, 2)
     node = np.arange(len(ends))
@@ -34,7 +34,7 @@ def joined(lines: list[FloatArray], tolerance: float) -> list[tuple[FloatArray, 
         if len(ends_here) == 2:
             partner[ends_here[0]], partner[ends_here[1]] = ends_here[1], ends_here[0]
     found, done = [], set()
-    # Open chains begin at an end without partner; what is left are rings.
+    # Open chains begin at an end without a partner; the remaining lines are rings.
     starts = [end for end in range(2 * len(lines)) if end not in partner]
     for start in (*starts, *range(2 * len(lines))):
         if start // 2 in done:
@@ -55,9 +55,9 @@ def joined(lines: list[FloatArray], tolerance: float) -> list[tuple[FloatArray, 
 
 
 def opened(ring: FloatArray, holes: tuple[FloatArray, ...]) -> FloatArray | None:
-    """A ring with its holes as one simple ring: each hole is joined to it by a slit of 1 mm.
+    """Return a ring with its holes as one simple ring; slits of 1 mm connect the holes to it.
 
-    None where a hole cannot be reached by a straight slit from a corner to a corner.
+    None if a hole cannot be reached by a straight slit between two corners.
     """
     ring = ring if area(ring) > 0 else ring[::-1]
     left = [hole if area(hole) < 0 else hole[::-1] for hole in holes]
@@ -89,13 +89,13 @@ def opened(ring: FloatArray, holes: tuple[FloatArray, ...]) -> FloatArray | None
 
 
 def _towards(start: FloatArray, end: FloatArray) -> FloatArray:
-    """A point one slit away from `start`."""
+    """Return a point one slit width away from `start`."""
     away = end - start
     return start + min(0.5, _SLIT_M / max(float(np.linalg.norm(away)), 1e-12)) * away
 
 
 def _is_blocked(a: FloatArray, b: FloatArray, edges: FloatArray) -> bool:
-    """Whether the line from `a` to `b` crosses or touches an edge that ends at neither."""
+    """Return whether the line from `a` to `b` crosses or touches an edge that ends at neither."""
     own = (edges == a).all(axis=-1).any(axis=-1) | (edges == b).all(axis=-1).any(axis=-1)
     start, end = edges[~own, 0], edges[~own, 1]
 

@@ -1,4 +1,4 @@
-"""Tables as TOML that people go on with: comments, one entry a block, long lists in lines."""
+"""Write tables as TOML for people to edit: comments, one block per entry, wrapped lists."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 __all__ = ["plain", "to_toml"]
 
 _WIDTH = 96
-# Remarks on tables, by their name.
+# Remarks on tables, by the name of the table.
 _REMARKS = {
     "anchors": "number of anchors to place, `fixed` ones included",
     "zones": "where the body works; requirements: position_m = 0.10, heading_deg = 5.0, "
@@ -27,15 +27,15 @@ _REMARKS = {
 
 
 def to_toml(tables: Mapping[str, Any], head: list[str]) -> str:
-    """A building file with comments.
+    """Return a building file as text, with comments.
 
     Parameters
     ----------
     tables
-        Of the file: texts and numbers, tables, lists of tables. The key ``#`` of a table is a
-        comment.
+        Tables of the file: texts and numbers, tables, lists of tables. The key ``#`` of a table is
+        a comment.
     head
-        Lines of the comment at its top.
+        Lines of the comment at the top.
     """
     lines = [f"# {line}" for text in head for line in _wrapped(text)]
     tables = dict(tables)
@@ -50,7 +50,7 @@ def to_toml(tables: Mapping[str, Any], head: list[str]) -> str:
             if number:
                 lines.append("")
             table = f"[[{key}]]" if _is_tables(value) else f"[{key}]"
-            # A layer may be called anything: the comment stays on its line.
+            # A layer name may contain line breaks, but the comment must stay on its line.
             note = " ".join(str(entry.get("#", "")).split())
             lines.append(f"{table}  # {note}" if note.isprintable() and note else table)
             lines += [_assigned(name, item) for name, item in entry.items() if name != "#"]
@@ -58,7 +58,7 @@ def to_toml(tables: Mapping[str, Any], head: list[str]) -> str:
 
 
 def plain(tables: Any) -> Any:
-    """The same tables without comments."""
+    """Return the same tables without comments."""
     if isinstance(tables, Mapping):
         return {key: plain(value) for key, value in tables.items() if key != "#"}
     return [plain(value) for value in tables] if isinstance(tables, list) else tables
@@ -69,7 +69,7 @@ def _is_tables(value: Any) -> bool:
 
 
 def _assigned(key: str, value: Any) -> str:
-    """``key = value``; a list too long for a line over several."""
+    """Return ``key = value``; a long list is wrapped."""
     line = f"{key} = {_value(value)}"
     if len(line) <= _WIDTH or not isinstance(value, list):
         return line

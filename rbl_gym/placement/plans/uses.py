@@ -1,4 +1,4 @@
-"""What a layer is taken for: the words of the command line, and the keys that entries have."""
+"""Parse the uses of layers on the command line, and define the keys of their entries."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 __all__ = ["KEYS", "KINDS", "MATERIALS", "Use", "parse_use"]
 
-# What a layer can be, with the keys that its entries may have: those of the file, and
-# `side_by_side_m`: walls drawn as two lines that are no further apart.
+# Kinds of use, with the allowed keys of their entries: those of the file, and `side_by_side_m`, the
+# maximum distance of the two lines of a wall.
 KEYS = {
     "walls": ("material", "information", "thickness_m", "low_m", "high_m", "side_by_side_m"),
     "obstacles": ("material", "information", "low_m", "high_m"),
@@ -22,7 +22,7 @@ KEYS = {
 }
 KINDS = tuple(KEYS)
 TEXTS = {"material", "name", "attitude", "kind", "side"}
-# Share of a link's information that one crossing leaves, 10^(-loss / 10 dB): rough at 6 GHz.
+# Share of the information of a link after one crossing, 10^(-loss / 10 dB); rough at 6 GHz.
 MATERIALS = {
     "drywall": 0.7,
     "glass": 0.6,
@@ -34,7 +34,7 @@ MATERIALS = {
 
 
 class Use(NamedTuple):
-    """What the layers of a name are taken for: one of `KINDS`, with the keys of its entries."""
+    """Use of the layers with a name: one of `KINDS`, with the keys of its entries."""
 
     kind: str
     layer: str
@@ -42,12 +42,12 @@ class Use(NamedTuple):
 
 
 def parse_use(kind: str, text: str) -> Use:
-    """``LAYER,KEY=VALUE,...`` as a `Use`; `*` in a layer's name stands for any letters.
+    """Parse ``LAYER,KEY=VALUE,...``; `*` in the name of a layer matches any characters.
 
     Raises
     ------
     ValueError
-        On a key that entries of this kind do not have.
+        If entries of this kind have no such key.
     """
     layer, *parts = (part.strip() for part in text.split(","))
     if not layer or "=" in layer:
@@ -74,7 +74,7 @@ def parse_use(kind: str, text: str) -> Use:
 
 
 def number(name: str, value: Any) -> float:
-    """A finite number, or a ValueError."""
+    """Return a finite number; raise ValueError otherwise."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -26,9 +26,9 @@ from rbl_gym.studies.calibrate.files import write_link_table, write_points
 
 __all__ = ["AnchorSettings", "SurveyedAnchors", "read_anchor_ranges", "survey_anchors"]
 
-# Biases that are tried where anchors are found from nothing (m).
+# Biases (m) to try if anchors are found without start positions.
 _BIASES = (0.0, 0.15, 0.3)
-# Relative standard deviations of the size above this are said.
+# A larger relative standard deviation of the scale is reported.
 _SCALE = 0.002
 
 
@@ -82,11 +82,11 @@ class SurveyedAnchors(NamedTuple):
     survey
         Anchors, poses, biases, covariance, residuals.
     times
-        (K,) times of the epochs used.
+        Times (K,) of the epochs used.
     links
-        (M, N) links with ranges.
+        Links (M, N) with ranges.
     anchor_ids, tag_ids
-        In the order of the arrays.
+        Ids, in the order of the arrays.
     figures
         Plain numbers, as written by `rbl-gym calibrate --json`.
     """
@@ -128,7 +128,7 @@ def read_anchor_ranges(path: AnyPath, anchor_ids: tuple[str, ...]) -> FloatArray
     Returns
     -------
     pairs
-        (M, M) metres, 0 without a range.
+        Ranges (M, M) in metres, 0 without a range.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def survey_anchors(
     settings
         Start, known anchors, biases.
     pairs
-        (M, M) ranges between anchors, metres, 0 without a range (`read_anchor_ranges`).
+        Ranges (M, M) between anchors, metres, 0 without a range (`read_anchor_ranges`).
     advance
         Called after each of the three parts of the work.
 

@@ -15,11 +15,11 @@ from rbl_gym.measurements.direction_bias import direction_bias
 from rbl_gym.studies.calibrate.known_path import Log, path_at
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
-# Epochs that tell where tags are about, and how a fit moves with the clock.
+# Number of epochs used to find the tags, and the change of a fit with the clock.
 _FEW_EPOCHS = 1000
-# Links and harmonics are fitted in turn so often.
+# Number of rounds in which links and harmonics are fitted in turn.
 _ROUNDS = 2
-# Harmonics that are looked at where they are not asked for: how far arms can be trusted.
+# Number of harmonics to fit if none are requested, which shows how reliable the tags are.
 _LOOKED_AT = 3
 
 
@@ -34,7 +34,7 @@ def fit_log(
 ) -> LinkFit:
     """Return the fit to all epochs, or to `few` of them, for a clock offset of the truth.
 
-    `beta` (K, M, N) metres is subtracted from the ranges first.
+    `beta` (K, M, N), metres, is subtracted from the ranges first.
     """
     at = slice(None, None, max(1, len(log.times) // _FEW_EPOCHS) if few else 1)
     path, known = path_at(log, settings, shift)
@@ -50,7 +50,7 @@ def with_directions(
     """Return the fit of links after biases by direction are subtracted, and these biases."""
     path, known = path_at(log, settings, shift)
     links = log.links & known[:, None, None]
-    # Tags that turn or move are what a first harmonic at the tags is.
+    # If tags may turn or move, their motion is already a first harmonic at the tags.
     first = 1 if model.tags == "held" else 2
     candidates = candidates_of(settings.harmonics or _LOOKED_AT, settings.ends)
     beta = np.zeros(log.ranges.shape)

@@ -31,11 +31,11 @@ def write_link_table(
     path
         File; its folder is created.
     anchor_ids, tag_ids
-        In the order of the arrays.
+        Ids, in the order of the arrays.
     columns
-        (M, N) each, by the names in the header.
+        Values (M, N) of each column, by its name in the header.
     told
-        (M, N) links with a row.
+        Links (M, N) with a row.
     """
     _write(
         path,
@@ -83,7 +83,7 @@ def write_directions(
     ids
         Ids of the anchors and of the tags, in the order of the arrays.
     law
-        Ends without a harmonic have no row.
+        Bias by direction; ends without a harmonic have no row.
     """
     rows = []
     sides = (("anchor", law.anchors, law.anchors_log_std), ("tag", law.tags, law.tags_log_std))

@@ -14,10 +14,10 @@ from rbl_gym.recordings import InertialLog, TimeOffset, Truth, time_offset
 
 __all__ = ["CalibratedInertial", "calibrate_inertial", "inertial_figures"]
 
-# Rates of both are those of a grid of this spacing, smoothed by so many points of it.
+# Spacing (s) of the grid for the rates of both, and width of their smoothing in grid points.
 _STEP_S, _SMOOTH = 0.02, 5.0
 _LONGEST_GAP_S = 0.2
-# Clock and turn are found in turn so often.
+# Number of rounds in which clock and rotation are estimated in turn.
 _ROUNDS = 2
 
 
@@ -65,7 +65,7 @@ def calibrate_inertial(
     gyro = log.readings[:, :3]
     bias = np.zeros(3)
     for _ in range(_ROUNDS):
-        # Lengths do not hang on how the sensor sits, but on its bias.
+        # The norm of a rate does not depend on the orientation of the sensor, but on its bias.
         lengths = (np.linalg.norm(a, axis=1) for a in (body, gyro - bias))
         clock = time_offset(middle, next(lengths), log.times, next(lengths), search_s)
         turn = _turn(log.times - clock.offset_s, gyro, middle, body)
@@ -108,6 +108,6 @@ def inertial_figures(found: CalibratedInertial, truth_offset_s: float = 0.0) -> 
 
 
 def _smoothed(times: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
-    """Values (n, 3) on a grid."""
+    """Return values (n, 3), smoothed, on a grid."""
     columns = [np.interp(grid, times, column) for column in values.T]
     return gaussian_filter1d(np.stack(columns, axis=-1), _SMOOTH, axis=0, mode="nearest")

@@ -16,9 +16,9 @@ from rbl_gym.recordings import truth_at
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
-# Shifts of time that are tried (s), and how well a clock must be told to be taken.
+# Range of tested time shifts (s), and largest standard deviation of an accepted clock.
 _SEARCH_S, _CLOCK_STD_S = 1.0, 0.05
-# Epochs that coarse starts are compared on, and by how much another turn must fit better than none.
+# Number of epochs for coarse starts, and the ratio of misfits below which a rotation is accepted.
 _COARSE, _BETTER = 400, 0.8
 
 
@@ -90,7 +90,7 @@ def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, 
         Q, p, ok = truth_at(truth, run.times + shift, settings.truth_gap_s)
         still = truth.times[-1] - truth.times[0] > 0 and not np.ptp(truth.translation, axis=0).any()
         if still and (truth.rotation is None or not np.ptp(truth.rotation, axis=0).any()):
-            ok = np.ones_like(ok)  # a body that stands stands a little earlier and later too
+            ok = np.ones_like(ok)  # a body at rest is also at rest shortly before and after
         Q = np.broadcast_to(np.eye(3), (len(p), 3, 3)) if Q is None else Q
         if settings.planar:
             Q = rotations.exp(rotations.yaw(Q)[:, None] * np.array([0.0, 0.0, 1.0]))
@@ -108,7 +108,7 @@ def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, 
 def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
     """Return a coarse rotation (3, 3) of the tag table that fits the path.
 
-    The identity if it fits.
+    It is the identity unless another rotation fits clearly better.
     """
     if len(log.tags) == 1 and not log.tags.any():
         return np.eye(3)

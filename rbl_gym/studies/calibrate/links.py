@@ -32,10 +32,9 @@ from rbl_gym.studies.calibrate.settings import LinkSettings
 
 __all__ = ["CalibratedLinks", "calibrate_links"]
 
-# A parameter whose standard deviation stays above this share of what was thought of it before is
-# not determined.
+# A parameter is undetermined if its standard deviation remains above this share of its prior.
 _UNTOLD = 0.5
-# Links with fewer ranges than this (median) have antenna delays of nodes only.
+# With fewer ranges per link (median), only antenna delays of nodes are estimated.
 _FEW_RANGES = 30
 
 
@@ -51,9 +50,9 @@ class CalibratedLinks(NamedTuple):
     clock
         Clock of the truth; None if it was given or the ranges do not determine it.
     anchor_ids, tag_ids
-        In the order of the arrays.
+        Ids, in the order of the arrays.
     distances
-        (K, M, N) along the path, metres; NaN without a range.
+        Distances (K, M, N) along the path, metres; NaN without a range.
     figures
         Plain numbers, as written by `rbl-gym calibrate --json`.
     directions
@@ -144,7 +143,7 @@ def calibrate_links(
     first = LinkModel(biases, settings.slopes, "held" if tags == "held" else "turned",
                       settings.planar)  # fmt: skip
     if clock is not None:
-        # A clock is told well by tags that are where they belong.
+        # The clock is more accurate once the tags are at their estimated positions.
         coarse = fit_log(log, settings, first, turn, shift, few=True)
         turn, clock = coarse.rotation, clock_of(log, settings, coarse.tags) or clock
         shift = clock.offset_s
@@ -161,7 +160,7 @@ def calibrate_links(
     if clock is not None:
         fit = _with_clock(log, settings, model, fit, clock)
     if tags == "free" and found is not None:
-        # A first harmonic as large as the others looks like a shift of its tag.
+        # A first harmonic as large as the others is indistinguishable from a shift of its tag.
         told = fit.tags_std_m > 0
         fit = fit._replace(tags_std_m=np.where(told, np.hypot(fit.tags_std_m, found.spread_m), 0.0))
     advance()

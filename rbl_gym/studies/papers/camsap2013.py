@@ -1,4 +1,4 @@
-"""The tracking paper's experiment (Section V), its Figs 2 and 3, and each of its worded claims.
+"""Run the experiment of the tracking paper (Section V): Figs 2 and 3, and each of its statements.
 
 Source: S. P. Chepuri, A. Simonetto, G. Leus, A.-J. van der Veen, "Tracking position and
 orientation of a mobile rigid body", CAMSAP 2013.
@@ -43,25 +43,25 @@ FILTERS: Filters = {
 _CONSISTENT_KF = ("kf", {"sigma_q_scale": math.sqrt(2 / 3)})
 STEPS = 20
 THRESHOLDS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)
-# What the paper does not print.
+# Values that the paper does not give.
 ASSUMED = (
     "sampling time 1 s",
     "one draw of the four anchors for all trials",
     "sensor positions relative to their mean",
 )
-# Standard errors that a step may stray where the paper claims equality or order of the mean.
+# Number of standard errors that a step may deviate from an equality or order of means.
 _SIGMAS = 4.0
 
 
 class Example(NamedTuple):
-    """One trial of K steps, and the results of some filters, by label.
+    """One trial of K steps, and the results of some filters by label.
 
     Attributes
     ----------
     trials
         The trial, a batch of one.
     beliefs
-        Arrays (K, ...).
+        Beliefs, arrays (K, ...).
     errors
         Pose errors (K, 6) of the beliefs.
     """
@@ -72,7 +72,7 @@ class Example(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """A statement, its source (``"paper"`` or ``"ours"``), whether it held, and its figures."""
+    """A statement, its source (``"paper"`` or ``"ours"``), whether it holds, and its figures."""
 
     statement: str
     source: str
@@ -112,7 +112,7 @@ def tracking_experiment(
     Returns
     -------
     A dict of plain numbers and lists: ``filters`` (with the series of Figs 2 and 3 in
-    ``per_step``), ``bound``, ``claims``, ``assumed``, and ``trade`` where asked.
+    ``per_step``), ``bound``, ``claims``, ``assumed``, and ``trade`` if requested.
     """
     simulated = monte_carlo.simulate_trials(
         world or paper_scene(), trials, np.random.default_rng([seed, 0])
@@ -153,7 +153,7 @@ def _trade(trials: SimulatedTrials, advance: Advance) -> list[dict[str, float]]:
 
 
 def bound_per_step(trials: SimulatedTrials) -> dict[str, FloatArray]:
-    """Posterior Cramer-Rao bound of each step: rotation (Frobenius) and translation RMSE (K,)."""
+    """Return the posterior bound of each step: rotation (Frobenius) and translation RMSE (K,)."""
     variance = np.diagonal(trials.bound, axis1=-2, axis2=-1).mean(axis=1)
     return {
         "rotation_rmse": np.sqrt(2 * variance[:, :3].sum(axis=-1)),
@@ -162,7 +162,7 @@ def bound_per_step(trials: SimulatedTrials) -> dict[str, FloatArray]:
 
 
 def filter_figures(trace: Trace, bound: dict[str, FloatArray]) -> dict[str, Any]:
-    """The figures of a filter: over all steps, and per step."""
+    """Return the figures of a filter over all steps, and per step."""
     rotation, translation = rms(trace.frobenius, axis=1), _translation_rmse(trace)
     ratios = rotation / bound["rotation_rmse"], translation / bound["translation_rmse_m"]
     return {
@@ -198,7 +198,7 @@ def _root_mean(variance: FloatArray) -> FloatArray:
 def claims(
     traces: dict[str, Trace], consistent: Trace, bound: dict[str, FloatArray]
 ) -> list[Claim]:
-    """What the paper (Section V), and this package, say of the filters, judged step by step."""
+    """Test the statements of the paper (Section V), and ours, on the filters at each step."""
     rotation = {label: rms(trace.frobenius, axis=1) for label, trace in traces.items()}
     translation = {label: _translation_rmse(trace) for label, trace in traces.items()}
     angle = {label: trace.angular.mean(axis=1) for label, trace in traces.items()}
@@ -306,7 +306,7 @@ def _claims_of_ours(
 
 
 def _standard_error_of_ratio(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Standard error (K,) of the ratio of two paired RMSEs (K, B) where it is near 1."""
+    """Return the standard error (K,) of the ratio of two paired RMSEs (K, B), for ratios near 1."""
     a, b = one**2, other**2
     parts = a / a.mean(axis=1, keepdims=True) - b / b.mean(axis=1, keepdims=True)
     return np.maximum(0.5 * parts.std(axis=1) / np.sqrt(parts.shape[1]), 1e-12)
@@ -321,7 +321,7 @@ def _range_of(ratio: FloatArray) -> str:
 
 
 def example(seed: int) -> Example:
-    """One trial, for the picture."""
+    """Return one trial, for the figure."""
     trial = monte_carlo.simulate_trials(paper_scene(), 1, np.random.default_rng([seed, 1]))
     truth = trial.episode.rotation[0], trial.episode.translation[0]
     found = Example(trial, {}, {})

@@ -1,12 +1,12 @@
-"""The DOA paper's experiment: one base station, four tags, Newton's iteration and its competitors.
+"""Run the experiment of the DOA paper: one base station, four tags, Newton's iteration and others.
 
-R = I and t = (5, 5, 3) m as in the paper, and besides rotations drawn uniformly anew for every
-trial; angles with 0.01, 0.1 and 1 degree of noise; the body known to be on the side y > 0.
+The body has R = I and t = (5, 5, 3) m as in the paper, or a random rotation in every trial. Angles
+have 0.01, 0.1 and 1 degree of noise. The body is known to be on the side y > 0.
 
 Source: S. Wu, L. Ai, J. Zhan, L. Yang, Q. Wu, B. Zhou, "An efficient approach for rigid body
 localization via a single base station using direction of arrive measurement". It counts successes
-without saying what one is. Ours are two: ``near``, both errors within 6 times the trial's bound,
-and ``within_half_metre``, an error of the translation below 0.5 m.
+without a definition. We use two: ``near``, both errors within 6 times the bound of the trial, and
+``within_half_metre``, a translation error below 0.5 m.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ TABLE_1 = {
     "PSA": {"seconds": [5.3, 5.9, 8.9], "success_percent": [100, 100, 70]},
 }
 _HALF_METRE = 0.5
-# Trials this many times the bound off have found another optimum, or none.
+# A trial with larger errors, in multiples of the bound, has found another optimum or none.
 _NEAR = 6.0
 
 
 def doa_experiment(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
-    """Run every method at every noise of both settings, with the constrained Cramer-Rao bound.
+    """Run every method at every noise level of both settings, and compute the bound.
 
     Returns
     -------
-    A dict of plain numbers: ``settings[label]`` has ``sigma_deg``, ``bound`` and ``methods``,
-    each with its figures per noise: `rotation_rmse` (Frobenius) and `translation_rmse_m` of the
-    trials near the truth (both errors within 6 times the trial's bound), their ratios to the
-    bound, the shares `near`, `within_half_metre` (of t) and `converged`, median and largest
-    number of iterations to convergence (0: not counted), and processor time per trial, absolute
-    and over that of NIA. ``table_1`` is the paper's.
+    A dict of plain numbers. ``settings[label]`` has ``sigma_deg``, ``bound`` and ``methods``. Each
+    method has figures per noise level: `rotation_rmse` (Frobenius) and `translation_rmse_m` of the
+    trials near the truth (both errors within 6 times the bound of the trial), their ratios to the
+    bound, the shares `near`, `within_half_metre` (of t) and `converged`, the median and largest
+    number of iterations (0: not counted), and the processor time per trial, absolute and relative
+    to NIA. ``table_1`` holds the values of the paper.
     """
     result: dict[str, Any] = {"experiment": "doa2019", "trials": trials, "seed": seed}
     result["table_1"] = TABLE_1
@@ -80,7 +80,7 @@ def _noise(
     rng: np.random.Generator,
     advance: Advance,
 ) -> dict[str, dict[str, float]]:
-    """All methods and the bound at one noise."""
+    """Return the figures of all methods and the bound at one noise level."""
     tags, noise = bodies.doa2019(), bearing.AngleNoise(np.deg2rad(sigma_deg))
     rotation = np.tile(np.eye(3), (trials, 1, 1))
     if label == "random R":
@@ -109,7 +109,7 @@ def _noise(
 
 
 def _of_covariance(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Standard deviation of every trial: of R in Frobenius norm, and of t in metres."""
+    """Return the standard deviation of every trial: of R (Frobenius norm), and of t in metres."""
     variance = np.diagonal(P, axis1=-2, axis2=-1)
     return np.sqrt(2 * variance[..., :3].sum(-1)), np.sqrt(variance[..., 3:].sum(-1))
 
@@ -119,7 +119,7 @@ def _judged(
 ) -> dict[str, float]:
     turn = np.linalg.norm(found.rotation - rotation, axis=(-2, -1))
     shift = np.linalg.norm(found.translation - TRANSLATION, axis=-1)
-    # False where there is no pose, which is NaN.
+    # False for trials without a pose, whose errors are NaN.
     near = (turn < _NEAR * bound[0]) & (shift < _NEAR * bound[1])
     of_near = [float(rms(error[near])) if near.any() else 0.0 for error in (turn, shift)]
     expected = [float(rms(std[near])) if near.any() else 1.0 for std in bound]

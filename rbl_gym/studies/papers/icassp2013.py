@@ -1,4 +1,4 @@
-"""The static paper's experiment (Section 4): one epoch, every method, the bound.
+"""Run the experiment of the static paper (Section 4): one epoch, every method, the bound.
 
 Source: S. P. Chepuri, G. Leus, A.-J. van der Veen, "Position and orientation estimation of a
 rigid body: rigid body localization", ICASSP 2013.
@@ -44,13 +44,13 @@ class Setting(NamedTuple):
     Attributes
     ----------
     low, high
-        Corners of the cube the anchors are drawn from, metres.
+        Corners of the cube from which the anchors are drawn, metres.
     anchors
-        None: drawn again for every trial; an int: this number drawn once; or positions (M, 3).
+        None: drawn again in every trial; an int: this number, drawn once; or positions (M, 3).
     perturbation_m
         Standard deviation of the tag positions.
     tags
-        (N, 3), as known to the estimators.
+        Tag positions (N, 3) known to the estimators.
     """
 
     low: float
@@ -64,7 +64,10 @@ N_ANCHORS = 10
 
 
 def static_settings() -> dict[str, Setting]:
-    """Figs 2 and 3: both anchor regions, redrawn and fixed; (a) without, (b) with perturbation."""
+    """Return the settings of Figs 2 and 3.
+
+    Anchors are in one of two regions, redrawn or fixed; (a) without, (b) with perturbed tags.
+    """
     body = bodies.icassp2013()
     return {
         "[0, 100]^3": Setting(0, 100, None, 0.0, body),
@@ -89,7 +92,7 @@ def static_experiment(
     name
         Name of the result.
     settings
-        By label: `static_settings`, or others.
+        Settings by label: `static_settings`, or others.
     trials, seed
         Number of trials of each setting and reference range, and the random seed.
     advance
@@ -140,7 +143,7 @@ def _epoch(
     rng: np.random.Generator,
     advance: Advance,
 ) -> dict[str, dict[str, float]]:
-    """All methods and bounds at one reference range."""
+    """Return the figures of all methods and bounds at one reference range."""
     scene = scenes.SCENES["icassp2013"]
     rotation, translation = np.array(scene.start_rotation), np.array(scene.start_translation)
     anchors = rng.uniform(setting.low, setting.high, (trials, N_ANCHORS, 3))
@@ -185,7 +188,7 @@ def _achieved(
 
 
 def _expected(covariance: FloatArray, rotation: FloatArray) -> dict[str, float]:
-    """The figures of a bound over trials: root of the mean trace, mean of the expected angle."""
+    """Return the root of the mean trace of a bound over trials, and the mean expected angle."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, 6).mean(axis=0)
     angle = metrics.expected_mean_angular_error(covariance, rotation).mean()
     return {

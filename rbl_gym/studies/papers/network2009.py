@@ -1,13 +1,13 @@
-"""The sensing-network paper's experiment: its Figs 3 to 6, kappa against n, three nodes in space.
+"""Run the experiment of the network paper: Figs 3 to 6, kappa against n, three nodes in space.
 
 Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame and orientation
-localization for relative sensing networks". The variance is read as that of a bearing, sigma^2, so
-that an edge angle has 2 sigma^2; a mean square error is the mean over the edges. The paper's ten
-points are drawn, not printed: `PLACES` are ours. Beside the paper's figures: the speed of (14) on
-networks of ten nodes uniform in a square.
+localization for relative sensing networks". Its variance is taken as that of a bearing, sigma^2, so
+that an edge angle has 2 sigma^2. A mean square error is the mean over the edges. The paper shows
+its ten points only in a drawing; `PLACES` are ours. In addition to the figures of the paper, the
+convergence of (14) is measured on networks of ten nodes, uniform in a square.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
     "read_points",
 ]
 
-# Node 0, the reference, is the one at the bottom left, as in Fig. 6.
+# Node 0, the reference, is at the bottom left, as in Fig. 6.
 PLACES = np.array(
     [
         [0.07, 0.13],
@@ -49,7 +49,7 @@ PLACES = np.array(
         [0.95, 0.62],
     ]
 )
-LOOPS = (5, 10, 15, 20, 25, 30, 36)  # of Fig. 4, where no footprints are asked for
+LOOPS = (5, 10, 15, 20, 25, 30, 36)  # of Fig. 4, if no footprints are given
 VARIANCE, RUN_VARIANCE = 0.1, 0.01  # sigma^2 of Fig. 4, of Figs 5 and 6
 _SHOWN_LOOPS, _SHOWN_STEPS = 10, 60
 _TOL = 1e-9
@@ -60,13 +60,13 @@ EXAMPLE_LOOPS = 15
 BASES = network_graphs.BASES
 RULES = consensus.STEP_RULES
 LOSSES = (0.0, 0.2, 0.5)
-# Networks that convergence is measured on.
+# Number of networks on which convergence is measured.
 _NETWORKS = 10
 _STRETCHES = 6
 
 
 class DrawnNetwork(NamedTuple):
-    """A network of the experiment."""
+    """A network of the experiment, its true orientations, and its edge angles."""
 
     positions: FloatArray
     theta: FloatArray
@@ -83,38 +83,44 @@ def network_experiment(
     footprints: Sequence[float] | None = None,
     variance: float | None = None,
 ) -> dict[str, Any]:
-    """The paper's figures, and convergence.
+    """Compute the figures of the paper, and the convergence of (14).
 
     Parameters
     ----------
     trials, seed
-        Of Fig. 4 and of three nodes in space.
+        Number of trials of Fig. 4 and of three nodes in space, and the random seed.
     advance
-        Told of four steps.
+        Called after each of four steps.
     positions
-        (n, 2) fixed points, the first of which is the reference, or a CSV file of them with a
-        header x,y; None: `PLACES`.
+        Fixed points (n, 2), the first of which is the reference, or the path of a CSV file of them
+        with the header x,y; None: `PLACES`.
     footprints
-        Sensing radii, in the unit of the positions, each of which connects the points; None: those
-        that leave `LOOPS` loops (on other points: all that connect them, eight at most).
+        Sensing radii, in the unit of the positions. Each must connect the points. None: those that
+        give `LOOPS` loops; for other points, at most eight that connect them.
     variance
-        sigma^2 of a bearing; None: the paper's, 0.1 in Fig. 4, 0.01 in Figs 5 and 6.
+        Variance sigma^2 of a bearing; None: as in the paper, 0.1 in Fig. 4, 0.01 in Figs 5 and 6.
 
     Returns
     -------
-    A dict of plain numbers. ``networks`` (Fig. 3): points, footprints and edges. ``accuracy`` (Fig.
-    4): for each footprint the mean square error of y, of the limit psi of (14) and of maximum
-    likelihood, the bound ``2 sigma^2 (n - 1) / m`` and ratios to it. ``run`` (Figs 5 and 6): on the
-    largest footprint every edge's angle and every loop's error over the steps, and true, measured
-    and estimated orientations. ``convergence``: for each cycle basis and rule for kappa lambda_min
-    and lambda_max, the measured and the true factor, and Theorem 19's, with the share of networks
-    where it holds. ``asynchronous``: rounds for each share of lost messages. ``history``: errors of
-    a run. ``growth``: `network_growth.kappa_growth`. ``space``: three nodes in space.
+    A dict of plain numbers.
+
+    - ``networks`` (Fig. 3): points, footprints and edges.
+    - ``accuracy`` (Fig. 4): for each footprint the mean square error of y, of the limit psi of (14)
+      and of maximum likelihood, the bound ``2 sigma^2 (n - 1) / m``, and ratios to it.
+    - ``run`` (Figs 5 and 6): for the largest footprint, the angle of every edge and the error of
+      every loop over the steps, and true, measured and estimated orientations.
+    - ``convergence``: for each cycle basis and each rule for kappa, lambda_min and lambda_max, the
+      measured factor, the true one and that of Theorem 19, and the share of networks for which the
+      theorem holds.
+    - ``asynchronous``: rounds for each share of lost messages.
+    - ``history``: errors of a run.
+    - ``growth``: result of `network_growth.kappa_growth`.
+    - ``space``: three nodes in space.
 
     Raises
     ------
     ValueError
-        If a footprint leaves the points apart, or an argument is not as described.
+        If a footprint does not connect the points, or an argument is invalid.
     """
     if isinstance(positions, str):
         positions = read_points(positions)
@@ -168,12 +174,12 @@ def network_experiment(
 
 
 def read_points(path: str) -> FloatArray:
-    """Points (n, 2) of a CSV file with a header x,y.
+    """Read points (n, 2) from a CSV file with the header x,y.
 
     Raises
     ------
     ValueError
-        If the file holds something else; the message names it.
+        If the file is invalid; the message names it.
     """
     with open(path, encoding="utf-8") as file:
         header = file.readline().strip().replace(" ", "")
@@ -189,7 +195,11 @@ def read_points(path: str) -> FloatArray:
 
 
 def _default_footprints(places: FloatArray) -> list[float]:
-    """Radii that leave `LOOPS` loops of `PLACES`; of other points eight, from connected to all."""
+    """Return the default radii of footprints.
+
+    For `PLACES` they give `LOOPS` loops. For other points they are eight, from the smallest that
+    connects all points to one that connects all pairs.
+    """
     n_nodes = len(places)
     pairs = np.array(list(itertools.combinations(range(n_nodes), 2)))
     apart = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
@@ -212,7 +222,7 @@ def _seen(places: FloatArray, radius: float) -> IntArray:
 
 
 def draw_network(loops: int, rng: np.random.Generator) -> DrawnNetwork:
-    """A connected unit-disk graph with this many loops, its truth and its edge angles."""
+    """Draw a connected unit-disk graph with this many loops, its orientations and edge angles."""
     pairs = np.array(list(itertools.combinations(range(N_NODES), 2)))
     while True:
         positions = rng.uniform(0, 1, (N_NODES, 2))
@@ -229,12 +239,12 @@ def draw_network(loops: int, rng: np.random.Generator) -> DrawnNetwork:
 def _accuracy(
     places: FloatArray, edges: IntArray, sigma: float, trials: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """One footprint of Fig. 4, over orientations and noise drawn anew."""
+    """Return one footprint of Fig. 4, over random orientations and noise."""
     n_nodes, m = len(places), len(edges)
     i, j = edges.T
     theta = rng.uniform(-np.pi, np.pi, (trials, n_nodes))
     true = theta[:, j] - theta[:, i]
-    # (8): the noise of the two bearings of an edge.
+    # By (8), the noise of an edge is that of its two bearings.
     y = proj(true + sigma * rng.standard_normal((2, trials, m)).sum(axis=0))
     psi = limit(network_graphs.cycle_matrix(edges, n_nodes).toarray(), y)
     found = np.array([estimators.orientations(edges, one, n_nodes) for one in y])
@@ -256,7 +266,7 @@ def _accuracy(
 
 
 def limit(C: FloatArray, y: FloatArray) -> FloatArray:
-    """Limits (trials, m) of (14) from y, all trials at once, by Theorem 19's bound of kappa."""
+    """Return limits (trials, m) of (14) from y for all trials at once, with kappa by Theorem 19."""
     if not len(C):
         return y
     kappa, psi = 2 / (1 + np.linalg.eigvalsh(C @ C.T)[-1]), y.copy()
@@ -268,7 +278,7 @@ def limit(C: FloatArray, y: FloatArray) -> FloatArray:
 def _run(
     places: FloatArray, edges: IntArray, sigma: float, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """One run of (14): Fig. 5's curves, Fig. 6's frames."""
+    """Return one run of (14): the curves of Fig. 5, the frames of Fig. 6."""
     n_nodes = len(places)
     theta = rng.uniform(-np.pi, np.pi, n_nodes)
     theta = proj(theta - theta[0])
@@ -292,7 +302,7 @@ def _run(
 
 
 def _convergence(samples: list[DrawnNetwork], basis: str, rule: str) -> dict[str, Any]:
-    """Means over the networks; the measured factor against the true one at its worst."""
+    """Return means over the networks, and the largest difference of measured and true factor."""
     rows = [_one_convergence(one, basis, rule) for one in samples]
     table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
     return {
@@ -323,16 +333,16 @@ def _one_convergence(one: DrawnNetwork, basis: str, rule: str) -> dict[str, floa
 
 
 def distances_from_limit(C: Any, y: FloatArray, run: consensus.CycleRun) -> FloatArray:
-    """Distance of every psi of a run from the limit on its branch."""
+    """Return the distance of every psi of a run from the limit on its branch."""
     assert run.history is not None
     limit = consensus.cycle_projection(C, y, run.branch)
     return np.linalg.norm(run.history - limit, axis=1)
 
 
 def measured_factor(one: DrawnNetwork, C: Any, run: consensus.CycleRun) -> float:
-    """Factor of a step, from late errors that rounding does not yet touch.
+    """Return the factor of a step, from late errors that rounding does not yet affect.
 
-    They are stretched to their first size and iterated on, until one mode is left.
+    The errors are scaled to their initial size and iterated again, until one mode remains.
     """
     psi, factor = one.y, 0.0
     nothing = np.zeros(C.shape[0])
@@ -347,7 +357,7 @@ def measured_factor(one: DrawnNetwork, C: Any, run: consensus.CycleRun) -> float
         factor = float((distance[last] / distance[first]) ** (1 / (last - first)))
         assert again.history is not None
         stretched = (again.history[last] - limit) * (distance[0] / distance[last])
-        # Rounding off the cycles is stretched as well, and no step would take it away.
+        # Rounding errors outside the cycle space are scaled too, and no step would remove them.
         psi = limit + stretched - consensus.cycle_projection(C, stretched, nothing)
     return factor
 
@@ -367,7 +377,7 @@ def _asynchronous(
 
 
 def _history(one: DrawnNetwork, basis: str) -> dict[str, Any]:
-    """Distances from the limit over the steps of a run, and those that Theorem 19 prints."""
+    """Return distances from the limit over the steps of a run, and those of Theorem 19."""
     C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
     run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, history=True)
     assert run.kappa is not None

@@ -1,6 +1,6 @@
-"""The network paper's outlook, measured: kappa against n (Section IV-E), three nodes in space."""
+"""Measure the outlook of the network paper: kappa against n (Section IV-E), and nodes in space."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 
 WORST_SIZES = (6, 8, 11, 16, 23, 32)
 TRIANGULATION_SIZES = (10, 20, 40, 80, 160, 320)
-# Slopes in n are fitted to the largest sizes.
+# Number of largest sizes to which slopes in n are fitted.
 _FITTED = 4
 SHAPES = {
     "equilateral": [[0, 0, 0], [1, 0, 0], [0.5, 0.75**0.5, 0]],
@@ -35,13 +35,13 @@ SPACE_STD_RAD = (0.001, 0.01, 0.05)
 
 
 def kappa_growth(rng: np.random.Generator) -> dict[str, Any]:
-    """Kappa by every rule, and the true factor with it, for growing networks.
+    """Return kappa by every rule, and its true factor, for growing networks.
 
     Returns
     -------
-    ``worst``: complete graphs with the cycles of a path as their tree, of O(n) edges each;
-    ``triangulation``: Delaunay's of points uniform in a square, with its triangles as cycles. Each
-    has `rows` and, by rule, the `slope` of log kappa over log n.
+    ``worst``: complete graphs with the fundamental cycles of a path, which have O(n) edges each.
+    ``triangulation``: Delaunay triangulations of points uniform in a square, with their triangles
+    as cycles. Each has `rows` and, by rule, the `slope` of log kappa over log n.
     """
     graphs = {
         "worst": [(n, path_cycles(n)) for n in WORST_SIZES],
@@ -76,7 +76,7 @@ def _grown(sizes: list[tuple[int, sp.csr_matrix]]) -> dict[str, Any]:
 
 
 def path_cycles(n_nodes: int) -> sp.csr_matrix:
-    """Cycles of the complete graph, each an edge (i, j) and the path i, i + 1, ..., j back."""
+    """Return cycles of the complete graph: an edge (i, j) and the path i, i + 1, ..., j back."""
     pairs = list(itertools.combinations(range(n_nodes), 2))
     column = {pair: k for k, pair in enumerate(pairs)}
     closing = [pair for pair in pairs if pair[1] > pair[0] + 1]
@@ -88,7 +88,7 @@ def path_cycles(n_nodes: int) -> sp.csr_matrix:
 
 
 def triangles(places: FloatArray) -> sp.csr_matrix:
-    """The triangles of the Delaunay triangulation of points (n, 2): a basis of its cycles."""
+    """Return the triangles of the Delaunay triangulation of points (n, 2), a cycle basis."""
     corners = np.sort(Delaunay(places).simplices, axis=1)
     sides = corners[:, [0, 1, 1, 2, 0, 2]].reshape(-1, 2)
     edges, column = np.unique(sides, axis=0, return_inverse=True)
@@ -98,13 +98,13 @@ def triangles(places: FloatArray) -> sp.csr_matrix:
 
 
 def three_in_space(trials: int, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Orientations of three nodes from their mutual bearings, against the bound.
+    """Estimate the orientations of three nodes from mutual bearings, and compare with the bound.
 
     Returns
     -------
-    A row for each shape and noise: root mean square turn of nodes 1 and 2 against node 0, the bound
-    of it, their ratio, and the standard deviation of the misfit of the interior angles over
-    ``sqrt(6) sigma``.
+    A row for each shape and noise: root mean square rotation error of nodes 1 and 2 relative to
+    node 0, its bound, their ratio, and the standard deviation of the error of the sum of the
+    interior angles over ``sqrt(6) sigma``.
     """
     rows = []
     for (shape, places), sigma in itertools.product(SHAPES.items(), SPACE_STD_RAD):

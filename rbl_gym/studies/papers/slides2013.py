@@ -1,8 +1,8 @@
-"""The experiments of the slides: 5 tags on a rectangular pyramid, 4 anchors, static and dynamic.
+"""Run the experiments of the slides: 5 tags on a rectangular pyramid, 4 anchors.
 
-Source: the slides "Rigid body localization and tracking", which join the static paper
-(ICASSP 2013) and the tracking paper (CAMSAP 2013). They print no parameters: those are of the
-two papers, the body's size is that of the static paper's.
+Source: the slides "Rigid body localization and tracking", which combine the static paper (ICASSP
+2013) and the tracking paper (CAMSAP 2013). They give no parameters. We use those of the two papers,
+and the size of the body of the static paper.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = [
 ]
 
 TAGS = bodies.centred([[0, 0, 0], [5, 0, 0], [5, 4, 0], [0, 4, 0], [2.5, 2, 5]])
-# Four alternate corners of a cube, the best that four can do.
+# Four alternate corners of a cube, the best layout of four anchors.
 ANCHORS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1.0]])
 # The slides have no event-triggered filter.
 FILTERS = {label: value for label, value in camsap2013.FILTERS.items() if label != "ET-KF"}
 
 
 def slides_settings() -> dict[str, Setting]:
-    """Of the static part."""
+    """Return the settings of the static part."""
     return {
         "[0, 100]^3": Setting(0, 100, 100 * ANCHORS, 0.0, TAGS),
         "[-50, 50]^3": Setting(-50, 50, 100 * ANCHORS - 50, 0.0, TAGS),
@@ -41,12 +41,12 @@ def slides_settings() -> dict[str, Setting]:
 
 
 def slides_scene() -> Scene:
-    """Of the dynamic part: the tracking paper's world with the body of the slides."""
+    """Return the world of the dynamic part: the tracking paper with the body of the slides."""
     return dataclasses.replace(camsap2013.paper_scene(), tags=as_tuples(TAGS))
 
 
 def slides_experiment(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
-    """The static experiment, with `camsap2013.tracking_experiment` as its ``"dynamic"``."""
+    """Run the static experiment; ``"dynamic"`` holds `camsap2013.tracking_experiment`."""
     static = icassp2013.static_experiment("slides2013", slides_settings(), trials, seed, advance)
     dynamic = camsap2013.tracking_experiment(
         trials, seed, advance, world=slides_scene(), filters=FILTERS
