@@ -25,7 +25,7 @@ from rbl_gym.motion.kinematics import ProcessNoise
 
 State = TypeVar("State", bound=tuple[Any, ...])
 _FLOAT64 = np.dtype(np.float64)
-# By how much a covariance may be off its transpose, in units of its largest entry.
+# Largest accepted asymmetry of a covariance, in units of its largest entry.
 _SYMMETRIC = 1e-8
 
 # Variance of an entry of a uniformly random rotation: the variance of an uninformative prior.
@@ -35,12 +35,13 @@ VAGUE_ENTRY_VARIANCE = 1 / 3
 def check_prior(
     rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike, sizes: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rotation (..., 3, 3), translation (..., 3), covariance of one of the sizes; or a ValueError.
+    """Return a checked prior: rotation, translation, and covariance of one of the sizes.
 
-    Each may have leading axes of its own, which broadcast.
+    The rotation is (..., 3, 3) and the translation (..., 3). Leading axes may differ, but must
+    broadcast. Raises ValueError if an array is invalid.
     """
     if _is_plain_prior(rotation, translation, covariance, sizes):
-        # The quick way of one body; what is wrong goes the long one, which names it.
+        # Fast path for one body. Invalid input takes the slow path, which names the error.
         return rotation, translation, covariance  # pyright: ignore[reportReturnType]
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
@@ -50,7 +51,7 @@ def check_prior(
 def _is_plain_prior(
     rotation: Any, translation: Any, covariance: Any, sizes: tuple[int, ...]
 ) -> bool:
-    """Whether these are arrays of one body, and all is well with them."""
+    """Return whether the arguments are valid arrays of one body."""
     return (
         type(rotation) is type(translation) is type(covariance) is np.ndarray
         and rotation.dtype == translation.dtype == covariance.dtype == _FLOAT64
@@ -67,10 +68,10 @@ def _is_plain_prior(
 def is_sound(
     rotation: FloatArray, covariance: FloatArray, off_orthogonal: float, off_symmetric: float
 ) -> BoolArray:
-    """Whether rotations are proper, and covariances symmetric and clearly positive definite (...).
+    """Return whether rotations are proper, and covariances symmetric and positive definite (...).
 
-    `off_orthogonal`: by how much entries of ``Q Q^T`` may be off the identity; `off_symmetric`:
-    those of the covariance off its transpose, in units of its largest.
+    `off_orthogonal` is the largest accepted difference of ``Q Q^T`` and the identity.
+    `off_symmetric` is that of the covariance and its transpose, in units of its largest entry.
     """
     Q, P = rotation, covariance
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(axis=(-2, -1))

@@ -147,7 +147,7 @@ def iekf_log(
         filter = AugmentedEkf(pose, law, None, (stays, moves), directions)
     else:
         sensor = odometry if isinstance(odometry, OdometrySensor) else OdometrySensor(**odometry)
-        # A bias that cannot be needs no states.
+        # A bias with zero standard deviation needs no states.
         biases = tuple(bias for bias in (stays, moves) if bias.std_m or bias.common_std_m)
         filter = OdometryEkf(pose, law, None, biases, directions, sensor)
     return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)

@@ -127,7 +127,7 @@ class _Rows(NamedTuple):
     epoch: np.ndarray  # (n,)
     anchor: np.ndarray
     tag: np.ndarray
-    part: np.ndarray  # (n,) which stretch of time
+    part: np.ndarray  # index of the interval of time
     distance: FloatArray
     features: FloatArray  # (n, 2 H (M + N)), by harmonic, then node: cosine, sine
     nodes: tuple[int, int]

@@ -75,7 +75,7 @@ class Problem(NamedTuple):
     rotation: FloatArray
     design: FloatArray  # (2 M N + G, P) from parameters to those of links and the G others
     prior: FloatArray  # (P,) standard deviations
-    n_link: int  # how many of the parameters are of links
+    n_link: int  # number of link parameters
 
 
 class Fit(NamedTuple):

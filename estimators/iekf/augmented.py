@@ -263,8 +263,10 @@ class AugmentedEkf:
     def biases_of(
         self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Extra states (..., K), covariance, and derivative (M N, K) of the ranges to anchors
-        (..., M, 3).
+        """Return extra states, their covariance, and the derivative of the ranges by them.
+
+        The extra states are (..., K), the covariance of pose and extra states is (..., 6 + K, 6 +
+        K), and the derivative of the ranges to anchors (..., M, 3) is (M N, K).
         """
         shape, count = (anchors.shape[-2], self.pose.tags.shape[-2]), len(self.biases)
         if self.biases:

@@ -5,7 +5,7 @@ The maximum-likelihood orientations minimise the sum of squared wrapped residual
 one factorised graph Laplacian, for any number of cycles.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportReturnType=false
 from __future__ import annotations
 
@@ -134,14 +134,14 @@ def along_tree(edges: IntArray, y: FloatArray, n_nodes: int) -> FloatArray:
 def chordal(
     edges: IntArray, y: FloatArray, n_nodes: int, weights: FloatArray | None = None
 ) -> FloatArray:
-    """Phases (n,) of ``min sum w |z_j - e^{iy} z_i|^2`` with ``z_0 = 1``."""
+    """Return phases (n,) of ``min sum w |z_j - e^{iy} z_i|^2`` with ``z_0 = 1``."""
     return _chordal(edges, y, n_nodes, check_weights(weights, edges))[0]
 
 
 def _chordal(
     edges: IntArray, y: FloatArray, n_nodes: int, weights: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """`chordal`, and the rank (n,) of the nodes in the order of elimination, node 0 first."""
+    """Return `chordal`, and the rank (n,) of the nodes in elimination order, node 0 first."""
     if n_nodes == 1:
         return np.zeros(1), np.zeros(1, dtype=np.intp)
     L = _laplacian(edges, weights * np.exp(-1j * y), n_nodes)

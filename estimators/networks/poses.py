@@ -1,10 +1,10 @@
-"""Poses of all nodes of many small planar networks: joint maximum a posteriori, in arrays.
+"""Estimate the poses of all nodes of many small planar networks by joint maximum a posteriori.
 
-The dense twin of `network_frames`, for batches: bearings and lengths between n nodes as (n, n)
-matrices, a prior where nothing is measured, and the covariance of what was found.
+This is the dense version of `network_frames`, for batches. Bearings and lengths between n nodes are
+(n, n) matrices. Where nothing is measured, a prior applies. The result includes the covariance.
 
-Bearings alone do not say how far away a node is. In a network that is not rigid, parts would
-shrink to a point without changing a bearing; what is known of the length of any link holds them.
+Bearings alone do not determine the distance of a node. In a network that is not rigid, parts could
+shrink to a point without changing a bearing. The known limits of every link length prevent this.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rbl_gym.networks.sensing import proj
 
 _MAX_STEPS = 60
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e9
-_SETTLED = 1e-8  # radians, and share of a link's typical length
+_SETTLED = 1e-8  # radians, and fraction of a link's typical length
 _REWEIGHTINGS = 3
 _NEAREST = 0.03  # of the typical length
 _HINT = 1e-6
@@ -45,10 +45,10 @@ class NetworkPoses(NamedTuple):
 
 
 class _Measured(NamedTuple):
-    links: BoolArray  # those with a path to node 0
+    links: BoolArray  # between nodes with a path to node 0
     bearings: FloatArray
     bearing_std: float
-    lengths: FloatArray  # typical and measured
+    lengths: FloatArray  # weighted mean of typical and measured length
     information: FloatArray  # of the lengths
     prior: FloatArray  # (3 n,) information
     nearest: float  # least distance in the derivatives, which bounds the information of bearings

@@ -1,8 +1,8 @@
 """Orientations of three nodes in space, and positions up to scale, from mutual bearings.
 
 The interior angles of a triangle sum to pi, which is the only redundancy of the six bearings.
-Maximum likelihood is therefore the ring's least squares (12): every angle takes a third of the
-misfit, half of it at either bearing. The frames are then exactly consistent,
+Maximum likelihood is therefore the least squares of a ring (12): each angle is corrected by a third
+of the misfit, half of it at each of its two bearings. The frames are then exactly consistent,
 ``R_1^0 R_2^1 R_0^2 = I`` (3).
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 
-# Layout of bearings: each row is of the nodes 0, 1, 2 and the next one.
+# Edges in the order of the bearings: each node with the next one.
 TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))
 _SMALLEST_SINE = 1e-9
 
