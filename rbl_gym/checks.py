@@ -23,7 +23,7 @@ BoolArray = NDArray[np.bool_]
 Axes = float | tuple[float, float, float]
 # Upper limit of lengths, times and rates; its powers are still finite.
 HUGE = 1e50
-# Up to this size BLAS sums in one thread.
+# Up to this size BLAS computes sums in one thread.
 _ONE_THREAD = 10_000
 _FLOAT64 = np.dtype(np.float64)
 

@@ -1,6 +1,6 @@
 """Measure the quality of beliefs: pose errors, consistency, error measures of the papers.
 
-Batched.
+All functions broadcast over leading axes.
 """
 
 from __future__ import annotations

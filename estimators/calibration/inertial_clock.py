@@ -38,8 +38,10 @@ _ROUNDS = 5
 
 
 class TaggedRanges(NamedTuple):
-    """Ranges in order of time.  (K,) seconds, metres, standard deviations; (K, 3) anchors, and tags
-    in the body frame; (K,) index of the link, from 0.
+    """Ranges in order of time: arrays (K,) and (K, 3).
+
+    Times in seconds, ranges and standard deviations in metres, anchor positions, tag positions in
+    the body frame, and the index of each link, from 0.
     """
 
     times: FloatArray
@@ -51,7 +53,7 @@ class TaggedRanges(NamedTuple):
 
 
 class InertialClock(NamedTuple):
-    """Time by which the clock of an inertial sensor is ahead of that of ranges.
+    """Time by which the clock of an inertial sensor is ahead of the clock of the ranges.
 
     Attributes
     ----------
@@ -71,10 +73,10 @@ class InertialClock(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """Some seconds of readings.
+    """A window of readings.
 
-    First step of the grid, band-passed forces (n, 3) in a level frame, rotations (S, 3, 3) of the
-    body in it and their times (S,).
+    It has the index of its first grid step, band-passed forces (n, 3) in a level frame, rotations
+    (S, 3, 3) from the body to this frame, and their times (S,).
     """
 
     start: int

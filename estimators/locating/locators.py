@@ -34,9 +34,9 @@ class StaticEpoch(NamedTuple):
     """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
 
     `weights` (B, M, N) are inverse variances of the ranges, 0 for missing links. `squared_weights`
-    are those of the squared ranges, (B, M, 1) if common to the tags. `tag_std_m` is the standard
-    deviation of the tag positions, `retraction` that of Newton's method in ``procrustes``, and
-    `offset` the kind of unknown range offset.
+    are inverse variances of the squared ranges, (B, M, 1) if common to the tags. `tag_std_m` is the
+    standard deviation of the tag positions, `retraction` the retraction of Newton's method in
+    ``procrustes``, and `offset` the kind of unknown range offset.
     """
 
     ranges: FloatArray

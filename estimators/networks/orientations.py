@@ -297,9 +297,11 @@ def _is_positive(S: sp.csc_matrix) -> bool:
 
 
 def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matrix:
-    """Return the Laplacian of complex links.  It is the Hermitian matrix with ``-links`` at (i, j),
-    their conjugates at (j, i), and the sums of their absolute values on the diagonal: the graph
-    Laplacian of weights, the connection Laplacian of ``e^{-iy}``.
+    """Return the Laplacian of complex links.
+
+    It is the Hermitian matrix with ``-links`` at (i, j), their conjugates at (j, i), and the sums
+    of their absolute values on the diagonal. For weights it is the graph Laplacian, for ``e^{-iy}``
+    the connection Laplacian.
     """
     i, j = edges.T
     nodes = np.arange(n_nodes)

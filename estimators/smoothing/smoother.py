@@ -1,9 +1,9 @@
 """Smoother: estimate all poses of a log together, each from all ranges before and after it.
 
 The estimate is the maximum a posteriori of the whole log, found by Gauss-Newton. Steps are damped
-if the cost would rise. The models are those of the filters: `KnownTwist` that of ``"iekf"``,
-`UnknownTwist` that of ``"iekf-cv"``, and biases of links. For a linear model the result equals
-that of the Rauch-Tung-Striebel smoother.
+if the cost would rise. The models are the same as in the filters: `KnownTwist` as in ``"iekf"``,
+`UnknownTwist` as in ``"iekf-cv"``, and link biases. For a linear model the result equals the
+Rauch-Tung-Striebel smoother.
 """
 
 from __future__ import annotations
@@ -238,7 +238,9 @@ def smooth(
 
 
 def _of_errors(P: FloatArray, state: LogState) -> FloatArray:
-    """Return the covariance of errors (..., K, n, n) from that of steps; see `with_turning`."""
+    """Return the covariance of errors (..., K, n, n) from the covariance of steps; see
+    `with_turning`.
+    """
     T = np.broadcast_to(np.eye(P.shape[-1]), P.shape).copy()
     T[..., 6:9, :3] = -rotations.hat(state.extra[..., :3])
     return T @ P @ np.swapaxes(T, -1, -2)

@@ -1,4 +1,4 @@
-"""Experiments of `rbl-gym reproduce`: those of the papers, and our own, by name."""
+"""List the experiments of `rbl-gym reproduce` by name: of the papers, and our own."""
 
 from __future__ import annotations
 

@@ -308,5 +308,5 @@ class PlanarNetworkEnv(ScalarEnv):
 
     @property
     def sensing(self) -> Sensing:
-        """What an estimator may know besides the observation."""
+        """The sensor models, which an estimator may know besides the observation."""
         return self._batch.sensing

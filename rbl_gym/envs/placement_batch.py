@@ -1,4 +1,4 @@
-"""What the environments that place anchors share: spaces, arrays of an episode, views."""
+"""Base classes of the environments that place anchors: spaces, episode arrays, views."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class PlacementBatchEnv(BatchEnv):
     def _plan(self, task: PlacementTask, n_anchors: int, n_features: int) -> None:
         """Set the spaces for up to M anchors and a description of the problem by F numbers.
 
-        Mirrored mounts of `task` are those of all tasks: mounts are at the same fractions of the
-        walls in all rooms.
+        The mirrored mounts of `task` are valid for all tasks, because mounts are at the same
+        fractions of the walls in all rooms.
         """
         self._mounts = placement.mounts(task) if self.sight else np.empty((0, 3))
         mounts = len(self._mounts)
@@ -275,7 +275,7 @@ class View:
         self._centre = _centre(volume)
         self.middle = _centre(task.scene.anchor_region) * _LEVEL
         half = _half(*volume.bounds())
-        # Of the region: the half size lies between zero and that of the volume.
+        # The half size of the region lies between zero and the half size of the volume.
         self._shift = np.concatenate([self._centre, 0.5 * half])
         self._scale = np.concatenate([half, 0.5 * half])
         self._box_shift = np.concatenate([0.5 * (low + high), np.zeros(3)])

@@ -78,8 +78,10 @@ class DirectionLaw(NamedTuple):
 
 
 class Directed(NamedTuple):
-    """Bias (..., M, N), its derivative (..., M, N, 6) by the pose error (w, v), log of the factor
-    on the standard deviation (..., M, N).
+    """Bias of every range, its derivative, and the effect on the standard deviation.
+
+    The bias is (..., M, N), its derivative by the pose error (w, v) is (..., M, N, 6), and the
+    logarithm of the factor on the standard deviation is (..., M, N).
     """
 
     bias: FloatArray

@@ -244,7 +244,7 @@ class StackedNoise:
 
     @property
     def _parts(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Return whether a law is that of squared ranges, and its two parameters, (..., 1, 1)."""
+        """Return whether a law is for squared ranges, and its two parameters, (..., 1, 1)."""
         kind, first, second, _ = np.moveaxis(self.numbers, -1, 0)[..., None, None]
         return kind == 1, first, second
 

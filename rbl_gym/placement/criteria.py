@@ -1,4 +1,4 @@
-"""Other measures of a layout than the score of `placement`."""
+"""Measures of a layout other than its score."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from rbl_gym.worlds.families import members_of, padded
 
 __all__ = ["TaskFamily", "described"]
 
-# Missing boxes are here: they have no size and block nothing.
+# Position of missing boxes, which have no size and block nothing.
 _NOWHERE = np.array([1e12, 1e12, 1e12, 0.0, 0.0, 0.0])
 _KINDS = (Box, Walls, Shell)
 

@@ -133,8 +133,8 @@ def _weight_slopes(
 ) -> tuple[FloatArray, FloatArray, int]:
     """Return minus the derivatives of ``log w`` by two squared distances (..., M, N).
 
-    These are the distance of the link, and that of the reference tag to the same anchor. The third
-    output is the index of the reference tag.
+    The first is the distance of the link, the second the distance of the reference tag to the same
+    anchor. The third output is the index of the reference tag.
     """
     if isinstance(noise, ranging.SquaredRangeNoise):
         return np.zeros_like(distance), 1 / distance[..., :1] ** 2 + 0 * distance, 0

@@ -1,4 +1,4 @@
-"""What the score of a layout depends on, on plain arrays: body, noise, poses, obstacles."""
+"""Collect all inputs of the score of a layout as arrays: body, noise, poses, obstacles."""
 
 from __future__ import annotations
 

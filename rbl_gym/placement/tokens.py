@@ -23,7 +23,7 @@ _LEAST = 1e-6
 
 
 class Scenery(NamedTuple):
-    """What the score of a layout depends on, as arrays with leading axes; lengths in any unit.
+    """All inputs of the score of a layout, as arrays with leading axes; lengths in any unit.
 
     Attributes
     ----------

@@ -102,7 +102,7 @@ class Motion(NamedTuple):
 
 # Number of fields of an `Episode` with a time axis.
 _TIMED = len(Epoch._fields)
-# Standard normals of an episode besides those of steps and ranges: rotation, spin, prior.
+# Number of standard normals of the start of an episode: rotation, spin, prior.
 _START_NORMALS = 4 + 3 + 6
 # Number of steps for which a random twist is constant.
 _HOLD = 10

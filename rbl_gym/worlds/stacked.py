@@ -24,7 +24,7 @@ from rbl_gym.worlds import simulation
 from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import FlatScales, Scene
 
-# Missing boxes are here: they have no size and block nothing.
+# Position of missing boxes, which have no size and block nothing.
 _NOWHERE = np.array([1e12, 1e12, 1e12, 0.0, 0.0, 0.0])
 
 

@@ -48,7 +48,7 @@ FILTERS = {
 
 
 def transfer_references(task: RlTask) -> list[str]:
-    """References for layouts besides policies, as far as the task has them."""
+    """Return the references for layouts that the task has, besides policies."""
     known = evaluation.references(task)
     return [name for name in ("random", "ring", "greedy-swaps", "hybrid") if name in known]
 

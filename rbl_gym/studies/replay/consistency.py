@@ -15,14 +15,15 @@ from rbl_gym.recordings.recording import Recording
 __all__ = ["contradicts", "nis_curve", "residual_tables"]
 
 # The data contradict a filter if the normalised innovations squared of a log, or of a tenth of it,
-# exceed this multiple of their expectation, or this share of ranges is rejected ...
+# exceed this multiple of their expectation, or if this share of the ranges is rejected,
 MOST_NIS, MOST_REFUSED, _PART = 1.5, 0.2, 0.1
-# ... and this is not random.
+# and if the probability of this by chance is below this value.
 _CHANCE = 1e-6
 _BLOCKS = 20
-# Also if the mean squared whitened innovation of an anchor or tag, clipped at that of a rejected
-# one, exceeds this value and this multiple of that of the others; or if more than half of those of
-# a link (with this number of ranges at least) exceed two standard deviations.
+# They also do if the mean squared whitened innovation of an anchor or tag exceeds the first value,
+# and the second multiple of the median over all of them; rejected innovations are clipped. Or if
+# more than half of the innovations of a link exceed the third value, in standard deviations. Both
+# need the fourth number of ranges.
 _MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
 
 
