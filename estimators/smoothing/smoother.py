@@ -238,9 +238,7 @@ def smooth(
 
 
 def _of_errors(P: FloatArray, state: LogState) -> FloatArray:
-    """Return the covariance of errors (..., K, n, n) from the covariance of steps; see
-    `with_turning`.
-    """
+    """Return the covariance (..., K, n, n) of errors from that of steps; see `with_turning`."""
     T = np.broadcast_to(np.eye(P.shape[-1]), P.shape).copy()
     T[..., 6:9, :3] = -rotations.hat(state.extra[..., :3])
     return T @ P @ np.swapaxes(T, -1, -2)

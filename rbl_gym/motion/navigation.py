@@ -2,8 +2,10 @@
 
 Over a sample of h seconds the readings minus their biases, (w, f), are taken as constant:
 
-    Q' = Q exp(w h) s  = Q exp(w h / 2) f                    specific force in the world frame, at
-    mid-rotation v' = v + (g + s) h t' = t + v h + (g + s) h^2 / 2
+    Q' = Q exp(w h)
+    s  = Q exp(w h / 2) f              (specific force in the world frame, at mid-rotation)
+    v' = v + (g + s) h
+    t' = t + v h + (g + s) h^2 / 2
 
 Readings between two epochs are preintegrated (Forster et al., IEEE T-RO 33, 2017): integrated from
 ``Q = I, t = v = 0`` without gravity. The result depends only on the biases. The error of a state is
