@@ -32,7 +32,8 @@ CONDITIONS = {
     "anchor-off": "the filter's position of the first anchor is 0.5 m off, in a random direction",
     "tag-off": "the filter's position of the first tag is 5 cm off",
 }
-# Streams of random numbers of a scene: episodes, additional links, errors of the known laws.
+# Streams of random numbers of a scene: episodes, additional links, errors of the geometry known to
+# filters.
 _WORLD, _LINKS, _TOLD = range(3)
 
 

@@ -19,7 +19,7 @@ from rbl_gym.studies.calibrate.settings import LinkSettings
 _FEW_EPOCHS = 1000
 # Number of rounds in which links and harmonics are fitted in turn.
 _ROUNDS = 2
-# Number of harmonics to fit if none are requested, which shows how reliable the tags are.
+# Number of harmonics to fit if none are requested, to judge the tag positions.
 _LOOKED_AT = 3
 
 

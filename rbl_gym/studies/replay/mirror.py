@@ -16,7 +16,8 @@ _THICK = 0.5
 # The position in the plane is known if its standard deviation is below the first share of the size
 # of the scene. Both poses start with the second share, and with this rotation (rad).
 _KNOWN, _START, _START_RAD = 0.2, 0.1, 0.3
-# Limit (rad) of the standard deviation of an undetermined rotation, so that filters converge.
+# Limit (rad) of the standard deviation of an undetermined rotation. It is below the value at
+# which filters start a global search.
 _MOST_RAD = 0.45
 # Squared whitened residuals are clipped at this value, for both poses.
 _MOST_RESIDUAL = 9.0

@@ -26,7 +26,7 @@ _BIASES_M = (-1.0, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1.0, 2.0)
 _HEIGHTS_M = (-2.0, -1.0, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1.0, 2.0)
 # Number of links, those with the largest residuals, that are tried for a bias.
 _LINKS = 4
-# Walk that replaces a walk of zero.
+# Least walk, also in place of zero, from which larger ones are derived.
 _LEAST_WALK_M, _LEAST_WALK_DEG = 0.03, 2.0
 # Number of values that are tried between two previous values.
 _STEPS = 4
