@@ -88,8 +88,9 @@ class Loss:
 
     Parameters
     ----------
-    For the iterated EKFs: False for squares; True for Huber's loss; ``"late"`` for the redescending
-    loss for late ranges. None: ``"late"`` for ``"iekf-log"``, else True.
+    robust
+        For the iterated EKFs: False for squares; True for Huber's loss; ``"late"`` for the
+        redescending loss for late ranges. None: ``"late"`` for ``"iekf-log"``, else True.
     """
 
     robust: bool | str | None = None
@@ -246,8 +247,9 @@ class Settings:
     filter
         Name of the filter. Options may follow it, as in ``"iekf/robust=late"``
         (`rbl_gym.estimators.parse_filter`).
-    Options of the filter that the other settings do not cover, as a dict or as pairs. Options after
-    the name are added to it. `robust` is the same option as in `loss`.
+    filter_options
+        Options of the filter that the other settings do not cover, as a dict or as pairs. Options
+        after the name are added to it. `robust` is the same option as in `loss`.
     range_std_m
         Standard deviation of a range; None: that of the recording if given, else
         `DEFAULT_RANGE_STD_M`, which includes link biases that change with the pose.
