@@ -109,9 +109,9 @@ def network_experiment(
       and of maximum likelihood, the bound ``2 sigma^2 (n - 1) / m``, and ratios to it.
     - ``run`` (Figs 5 and 6): for the largest footprint, the angle of every edge and the error of
       every loop over the steps, and true, measured and estimated orientations.
-    - ``convergence``: for each cycle basis and each rule for kappa, lambda_min and lambda_max, the
-      measured factor, the true one and that of Theorem 19, and the share of networks for which the
-      theorem holds.
+    - ``convergence``: a row for each cycle basis and rule for kappa. It has lambda_min, lambda_max,
+      the measured and the true factor, the factor of Theorem 19, and the share of networks for
+      which the theorem holds.
     - ``asynchronous``: rounds for each share of lost messages.
     - ``history``: errors of a run.
     - ``growth``: result of `network_growth.kappa_growth`.
