@@ -33,7 +33,7 @@ class TimedRange(NamedTuple):
     twist
         (..., 6) of the preceding interval; None: the filter estimates it.
     noise
-        Noise model of the range; None: that of the filter.
+        Noise model of the range; None: the noise model of the filter.
     anchors
         (..., M, 3) at its time; None: fixed anchors.
     """

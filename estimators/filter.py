@@ -71,7 +71,7 @@ class Filter(Protocol):
         """Return the state after the ranges (..., M, N) to anchors (..., M, 3).
 
         `links` (..., M, N) is True where measured; None: all. `noise` is the noise model of this
-        epoch; None: that of the filter.
+        epoch; None: the noise model of the filter.
         """
         ...
 

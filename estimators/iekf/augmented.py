@@ -157,7 +157,7 @@ class AugmentedEkf:
     ) -> AugmentedState:
         """Return the state after one epoch of ranges (..., M, N); links True = measured.
 
-        `noise` is the law of this epoch; None: that of the pose filter.
+        `noise` is the law of this epoch; None: the law of the pose filter.
 
         With biases, every update must have the same anchors in the same order. A vague prior is
         started as in `IteratedEkf`, with biases treated as noise.

@@ -95,7 +95,7 @@ class DoaEkf(IteratedEkf):
         links
             Mask (..., N) or (..., 1, N): which tags were received; None: all.
         noise, range_noise
-            Laws of the angles and of the ranges of this epoch; None: those of the filter.
+            Laws of the angles and of the ranges of this epoch; None: the laws of the filter.
         ranges, anchors, range_links
             (..., M, N), (..., M, 3) and their mask, of the same epoch; anchors None: one range
             to every tag, from the station.

@@ -147,7 +147,7 @@ class IteratedEkf:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> PoseState:
-        """Return the state after an epoch of ranges (..., M, N); `noise` None: that of the filter.
+        """Return the state after an epoch of ranges (..., M, N); `noise` None: the filter's law.
 
         If the prior rotation is vague in a direction that the epoch determines (first epoch, lost
         track), the update starts from many poses and keeps the best. Directions that the epoch does

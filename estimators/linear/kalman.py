@@ -178,7 +178,7 @@ class KalmanFamily:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> KalmanState:
-        """Return the state after an epoch of ranges (..., M, N); `noise` None: that of the filter.
+        """Return the state after an epoch of ranges (..., M, N); `noise` None: the filter's law.
 
         Fixed weights of the filter take precedence over any law.
 

@@ -77,7 +77,7 @@ class RangeLog(NamedTuple):
         (..., K, M, N), True where a range was measured; None: all.
     noise
         Noise model of these ranges, such as `rbl_gym.ranging.LinkNoise` with standard deviations
-        (..., K, M, N); None: that of the `LogModel`.
+        (..., K, M, N); None: the noise model of the `LogModel`.
     """
 
     times: ArrayLike

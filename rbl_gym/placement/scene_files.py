@@ -51,7 +51,7 @@ def problem(
     scene
         Name or path.
     n_anchors
-        Number of anchors; None: that of the scene or file.
+        Number of anchors; None: the number in the scene or file.
     region
         Corners of the work region, instead of the scene's volume or the file's zones.
     racks, seed

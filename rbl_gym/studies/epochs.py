@@ -50,7 +50,7 @@ class Reading(NamedTuple):
     links
         Mask (..., M, N), True if a range was measured; None: all.
     noise
-        Noise law of this epoch; None: that of the filter.
+        Noise law of this epoch; None: the noise law of the filter.
     twist
         Twist (..., 6), rad/s and m/s, of the interval that ends at this epoch; None: no interval,
         as at the first epoch.

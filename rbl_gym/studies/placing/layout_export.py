@@ -43,7 +43,7 @@ def mounting_list(
     problem, anchors
         The placement problem, and the anchor positions (M, 3), metres.
     names
-        Names of the anchors; None: those of the file, numbered from 1.
+        Names of the anchors; None: numbers from 1, in their order.
     """
     anchors = check_array("anchors", anchors, ("M", 3))
     names = [str(k + 1) for k in range(len(anchors))] if names is None else names

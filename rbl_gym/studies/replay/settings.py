@@ -251,7 +251,7 @@ class Settings:
         Options of the filter that the other settings do not cover, as a dict or as pairs. Options
         after the name are added to it. `robust` is the same option as in `loss`.
     range_std_m
-        Standard deviation of a range; None: that of the recording if given, else
+        Standard deviation of a range; None: the value of the recording if given, else
         `DEFAULT_RANGE_STD_M`, which includes link biases that change with the pose.
     motion, biases, odometry, inertial, loss, knowledge, comparison, smoothing
         The other settings, by subject.

@@ -95,7 +95,7 @@ def stage_of_scene(scene: Scene, steps: int | None = None) -> Stage:
     scene
         The scene.
     steps
-        Length of the episode; None: that of the scene, but at least a minute if the body stays
+        Length of the episode; None: the scene's length, but at least a minute if the body stays
         within its volume.
     """
     if steps is None:
