@@ -122,7 +122,7 @@ def loss_of(
         loss = log_score(case, told).mean()
     else:
         loss = log_score_in_sight(case, anchors).mean()
-    # Far outside the region there is nothing to learn.
+    # Penalise long steps: far outside the region there is nothing to learn.
     return loss + 1e-4 * (steps**2).mean(), float(loss.detach())
 
 
@@ -158,7 +158,7 @@ def _choice_loss(
 
 
 def alone(case: Case, spots: FloatArray, share: FloatArray) -> FloatArray:
-    """Information (B, C, P, 6, 6) of each candidate (B, C, 3) alone; shares (B, P, C)."""
+    """Return information (B, C, P, 6, 6) of each candidate (B, C, 3) alone; shares (B, P, C)."""
     tags, rotation, places = (x.double().numpy() for x in (case.tags, case.rotation, case.places))
     floor, growth = case.floor.double().numpy(), case.growth.double().numpy()
     law = np.stack([0 * floor, floor, growth, 0 * floor - 1], axis=-1)

@@ -57,7 +57,7 @@ def references(task: RlTask) -> list[str]:
 
 
 def strongest(task: RlTask) -> list[str]:
-    """Return the references of which the best, in each world, defines the score 1."""
+    """Return the references whose best result in each world defines the score 1."""
     known = references(task)
     return known[-len(search.STRONGEST) :] if known[-1] in search.STRONGEST else known[-1:]
 

@@ -155,7 +155,7 @@ def _nearest(where: _Where) -> FloatArray:
 
 
 def _boxes(rng: np.random.Generator, size: int) -> Batch:
-    """Boxes and planes below, above and around the body's volume."""
+    """Return problems in boxes and on planes below, above and around the body's volume."""
     half = np.stack(
         [np.ones(size), log_uniform(rng, 0.5, 1.0, size), log_uniform(rng, 0.05, 1.0, size)],
         axis=-1,
@@ -189,7 +189,7 @@ def _boxes(rng: np.random.Generator, size: int) -> Batch:
 
 
 def _shells(rng: np.random.Generator, size: int) -> Batch:
-    """Shells around a small volume."""
+    """Return problems in shells around a small volume."""
     half = np.exp(rng.uniform(-0.7, 0.0, (size, 3)))
     inner = log_uniform(rng, 1.0, 20.0, size)
     outer = inner * log_uniform(rng, 1.05, 10.0, size)
@@ -205,7 +205,7 @@ def _shells(rng: np.random.Generator, size: int) -> Batch:
 
 
 def _rooms(rng: np.random.Generator, size: int) -> Batch:
-    """Rooms with up to four racks on the floor."""
+    """Return problems in rooms with up to four racks on the floor."""
     floor = np.stack([np.ones(size), log_uniform(rng, 0.4, 1.0, size)], axis=-1)
     swap = rng.random(size) < 0.5
     floor[swap] = floor[swap][:, ::-1]

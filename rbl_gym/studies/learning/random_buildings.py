@@ -67,7 +67,7 @@ def buildings(rng: np.random.Generator, size: int) -> Batch:
 
 
 def again(rng: np.random.Generator, batch: Batch) -> Batch:
-    """One of the mirror images of the same buildings, with other bodies, noise and numbers."""
+    """Return a mirror image of the same buildings, with other bodies, noise and numbers."""
     seen = turned(batch.seen, int(rng.integers(8)))
     tags, noise = body_and_noise(rng, len(seen.extent), seen.extent)
     count = draw_count(rng, seen.fixed.shape[1])

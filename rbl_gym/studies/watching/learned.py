@@ -66,7 +66,7 @@ def learned_program(
 def played_program(
     path: str, env: gym.Env[Any, Any], filters: Iterable[str] | None = None, seed: int = 0
 ) -> Program:
-    """Return the program of a trained policy in an environment of its own.
+    """Return the program of a trained policy in a given environment.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def learned_frames(task: RlTask, policy: Policy, reference: str, seed: int) -> I
     others: list[float] = []
     beside = _reference_steps(task, reference, seed)
     for frame, (anchors, score) in zip(frames, beside, strict=False):
-        # At the reset nobody has acted yet.
+        # No action precedes the reset.
         if frame.time_s > 0:
             logs.append(math.log(frame.score_m))
             others.append(math.log(score))
