@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -36,20 +37,26 @@ def import_name(file: Path) -> str:
 
 FILES = sorted(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
 MODULES = {import_name(file): file for file in FILES}
-TREES = {name: ast.parse(file.read_text(encoding="utf-8")) for name, file in MODULES.items()}
 
 
-def imports(name: str) -> set[str]:
+@functools.cache
+def tree_of(name: str) -> ast.Module:
+    """The parsed source of a module."""
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
+@functools.cache
+def imports(name: str) -> frozenset[str]:
     """All modules a module imports, also inside functions; `from a import b` as a and a.b."""
     found = set()
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.module is not None
             found.add(node.module)
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def within(imported: str, package: str) -> bool:
@@ -99,27 +106,32 @@ ABOVE = ("estimators", "wrappers", "studies", "app")
 WORLD = [name for name in MODULES if not any(within(name, f"rbl_gym.{above}") for above in ABOVE)]
 
 
-@pytest.mark.parametrize("name", WORLD)
-def test_the_world_imports_nothing_that_stands_above_it(name):
-    for above in ABOVE:
-        assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
+def offences(names: Iterable[str], *packages: str) -> list[str]:
+    """Which of the modules import something of the packages, and what."""
+    return [
+        f"{name} imports {imported}"
+        for name in names
+        for imported in sorted(imports(name))
+        if any(within(imported, f"rbl_gym.{package}") for package in packages)
+    ]
 
 
-@pytest.mark.parametrize("name", modules_of("rbl_gym.estimators"))
-def test_estimators_import_only_the_plain_models(name):
-    ours = {m for m in imports(name) if within(m, "rbl_gym")} - {"rbl_gym"}
-    assert {m.split(".")[1] for m in ours} <= PLAIN_MODELS | {"estimators"}
+def test_the_world_imports_nothing_that_stands_above_it():
+    assert offences(WORLD, *ABOVE) == []
 
 
-@pytest.mark.parametrize("name", modules_of("rbl_gym.wrappers"))
-def test_wrappers_import_neither_studies_nor_the_app(name):
-    for above in ("studies", "app"):
-        assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
+def test_estimators_import_only_the_plain_models():
+    for name in modules_of("rbl_gym.estimators"):
+        ours = {m for m in imports(name) if within(m, "rbl_gym")} - {"rbl_gym"}
+        assert {m.split(".")[1] for m in ours} <= PLAIN_MODELS | {"estimators"}, name
 
 
-@pytest.mark.parametrize("name", modules_of("rbl_gym.studies"))
-def test_studies_do_not_import_the_app(name):
-    assert not [m for m in imports(name) if within(m, "rbl_gym.app")]
+def test_wrappers_import_neither_studies_nor_the_app():
+    assert offences(modules_of("rbl_gym.wrappers"), "studies", "app") == []
+
+
+def test_studies_do_not_import_the_app():
+    assert offences(modules_of("rbl_gym.studies"), "app") == []
 
 
 def package_of(name: str) -> str:
@@ -148,12 +160,21 @@ def test_modules_import_each_other_without_a_circle():
     files.prepare()
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_imports_are_absolute_and_by_the_one_name(name):
-    for node in ast.walk(TREES[name]):
-        assert not (isinstance(node, ast.ImportFrom) and node.level), f"line {node.lineno}"
-    bare = [m for m in imports(name) for folder in ("estimators", "wrappers") if within(m, folder)]
-    assert not bare
+def test_imports_are_absolute_and_by_the_one_name():
+    relative = [
+        f"{name}, line {node.lineno}"
+        for name in MODULES
+        for node in ast.walk(tree_of(name))
+        if isinstance(node, ast.ImportFrom) and node.level
+    ]
+    assert relative == []
+    bare = [
+        f"{name} imports {imported}"
+        for name in MODULES
+        for imported in imports(name)
+        if within(imported, "estimators") or within(imported, "wrappers")
+    ]
+    assert bare == []
 
 
 # What a module needs that may be absent: then, so is the module.
@@ -232,18 +253,26 @@ def random_names(tree: ast.Module) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_no_global_randomness(name):
-    assert set(random_names(TREES[name])) <= GENERATORS
-    assert "random" not in imports(name)
-    for node in ast.walk(TREES[name]):
-        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "default_rng":
-            assert node.args, f"line {node.lineno}: a generator without a seed"
+def test_no_global_randomness():
+    wrong = {
+        name: found for name in MODULES if (found := {*random_names(tree_of(name))} - GENERATORS)
+    }
+    assert wrong == {}
+    assert [name for name in MODULES if "random" in imports(name)] == []
+    without_seed = [
+        f"{name}, line {node.lineno}"
+        for name in MODULES
+        for node in ast.walk(tree_of(name))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "attr", "") == "default_rng"
+        and not node.args
+    ]
+    assert without_seed == []
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_no_module_is_longer_than_400_lines(name):
-    assert len(MODULES[name].read_text(encoding="utf-8").splitlines()) <= 400
+def test_no_module_is_longer_than_400_lines():
+    lines = {name: file.read_text("utf-8").count("\n") for name, file in MODULES.items()}
+    assert {name: count for name, count in lines.items() if count > 400} == {}
 
 
 def undocumented(node: ast.Module | ast.ClassDef, path: str = "") -> Iterator[str]:
@@ -257,11 +286,12 @@ def undocumented(node: ast.Module | ast.ClassDef, path: str = "") -> Iterator[st
                 yield from undocumented(child, f"{child.name}.")
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_everything_public_has_a_docstring(name):
-    assert list(undocumented(TREES[name])) == []
-    empty = not TREES[name].body
-    assert empty or ast.get_docstring(TREES[name])
+def test_everything_public_has_a_docstring():
+    missing = [f"{name}: {found}" for name in MODULES for found in undocumented(tree_of(name))]
+    assert missing == []
+    trees = {name: tree_of(name) for name in MODULES}
+    silent = [name for name, tree in trees.items() if tree.body and not ast.get_docstring(tree)]
+    assert silent == []
 
 
 @pytest.mark.parametrize("command", ["make demo", "make test"])
