@@ -1,5 +1,8 @@
 """Settings of all tests."""
 
+from collections import defaultdict
+
+import pytest
 from hypothesis import settings
 
 from rbl_gym import kernels
@@ -9,7 +12,39 @@ settings.register_profile("rbl", derandomize=True, deadline=None, max_examples=4
 settings.load_profile("rbl")
 
 
+def pytest_addoption(parser):
+    parser.addoption(
+        "--cases",
+        type=int,
+        metavar="N",
+        help="of each test with more cases run N: the first, the last, and some between",
+    )
+
+
 def pytest_configure(config):
     """Compile the kernels before workers start: each of them would, at the same time."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
         kernels.compile_all()
+
+
+@pytest.hookimpl(trylast=True)  # after `-m` has left out its own
+def pytest_collection_modifyitems(config, items):
+    most = config.getoption("cases")
+    if most is None:
+        return
+    cases = defaultdict(list)
+    for item in items:
+        cases[item.nodeid.partition("[")[0]].append(item)
+    kept = set()
+    for group in cases.values():
+        count = min(most, len(group))
+        kept |= {group[k * (len(group) - 1) // max(count - 1, 1)] for k in range(count)}
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = [item for item in items if item in kept]
+
+
+@pytest.fixture
+def no_search_for_causes(monkeypatch):
+    """A replay that contradicts its filter does not look for the fault, which takes seconds."""
+    causes = "rbl_gym.studies.replay.diagnosis.likely_causes"
+    monkeypatch.setattr(causes, lambda *_: [])

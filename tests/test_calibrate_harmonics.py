@@ -113,6 +113,7 @@ def test_tags_found_by_themselves_are_no_better_known_than_the_patterns_allow():
 
 
 @with_kernels
+@pytest.mark.usefixtures("no_search_for_causes")
 def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     rng = np.random.default_rng(4)
     law = pattern(rng)

@@ -211,6 +211,7 @@ def raw_files(tmp_path):
 
 
 @with_kernels
+@pytest.mark.usefixtures("no_search_for_causes")
 def test_replay_of_raw_ranges_learns_the_biases(raw_files, capsys):
     options = ["--planar", "--height-offset-m", "0.08", "--walk-m", "0.3", "--walk-deg", "10"]
     options += ["--range-std-m", "0.05", "--json"]

@@ -73,7 +73,7 @@ def test_ranges_localize_where_bearings_alone_do_not(network):
         frames(SQUARE, bearings, 4, ranges=np.where([1, 0, 0, 0], measured, 0), range_std_m=0.1)
 
 
-@pytest.mark.parametrize("trials", [80, pytest.param(500, marks=pytest.mark.long)])
+@pytest.mark.parametrize("trials", [40, pytest.param(500, marks=pytest.mark.long)])
 def test_errors_reach_the_bound_and_ranges_lower_it(network, trials):
     """To 4 standard deviations: the sums of variances, and all covariances together."""
     positions, theta, edges = network

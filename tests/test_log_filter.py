@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ def tails(rng, shape, share):
     return (rng.random(shape) < share) * rng.exponential(0.75, shape)
 
 
+@functools.cache
 def tracked(robust, late, trials=100, steps=25, dt=0.1, seed=0):
     """NEES per degree of freedom and position RMSE (m) of bodies that follow the filter's law."""
     rng = np.random.default_rng(seed)

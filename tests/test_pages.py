@@ -66,7 +66,7 @@ def opened(path: Path, script: str = "") -> str:
         path.write_text(text.replace("</body>", run), encoding="utf-8")
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
                "--enable-unsafe-swiftshader", f"--user-data-dir={path.parent / 'profile'}",
-               "--virtual-time-budget=10000", "--enable-logging=stderr", "--dump-dom"]  # fmt: skip
+               "--virtual-time-budget=2000", "--enable-logging=stderr", "--dump-dom"]  # fmt: skip
     done = subprocess.run(
         [BROWSER, *options, path.as_uri()], capture_output=True, text=True, timeout=120, check=True
     )

@@ -112,6 +112,7 @@ def test_laws_that_cannot_be_are_named(options):
 
 
 @with_kernels
+@pytest.mark.usefixtures("no_search_for_causes")
 def test_soft_knowledge_and_the_loss_for_late_ranges():
     log = recording()
     log = log._replace(
