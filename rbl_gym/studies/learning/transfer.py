@@ -88,7 +88,7 @@ def transfer_task(
 ) -> dict[str, Any]:
     """Return `transfer_loops` of a task with a filter in the loop, otherwise `transfer_layouts`.
 
-    Only layouts have `repeats`.
+    Arguments as in those functions; only layouts have `repeats`.
     """
     if task.env_id in _OWN_SCENES:
         return transfer_loops(task, policies, names, worlds, seed, advance)
