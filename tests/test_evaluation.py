@@ -448,6 +448,8 @@ def test_transfer_of_a_loop_by_hand():
 
 
 def test_transfer_of_a_loop_in_its_own_scene_and_a_short_one(tmp_path, capsys):
+    with pytest.raises(ValueError, match="policy 'other' does not fit"):
+        transfer.transfer_loops(rl_task("selection"), {"other": random_policy()}, [], 1, 0)
     path = tmp_path / "mine.npz"
     policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
     scene = tmp_path / "hall.json"

@@ -86,14 +86,9 @@ def transfer_task(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Run `transfer_loops` for a task with a filter in the loop, otherwise `transfer_layouts`.
+    """Return `transfer_loops` of a task with a filter in the loop, otherwise `transfer_layouts`.
 
-    Parameters
-    ----------
-    task, policies, names, worlds, seed, advance
-        As in these functions.
-    repeats
-        Bodies in each world; for layouts only.
+    Arguments as in those functions; only layouts have `repeats`.
     """
     if task.env_id in _OWN_SCENES:
         return transfer_loops(task, policies, names, worlds, seed, advance)
