@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import json
 from collections.abc import Callable, Mapping
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.checks import FloatArray, check_array, imported
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
@@ -214,14 +213,7 @@ def factory_of(name: str) -> Callable[..., Filter]:
     if found:
         return found[0].load()
     if isinstance(name, str) and ":" in name:
-        module, _, attribute = name.partition(":")
-        try:
-            factory: Callable[..., Filter] = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"filter {name!r:.80} cannot be imported: {error}") from error
-        if not callable(factory):
-            raise ValueError(f"filter {name!r:.80} must be callable, got {factory!r:.80}")
-        return factory
+        return imported("filter", name)
     raise ValueError(
         f"filter must be one of {', '.join(names())}, or a name given by "
         f"rbl_gym.estimators.register, or 'module:factory', got {name!r:.80}"

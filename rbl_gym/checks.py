@@ -8,6 +8,7 @@ use the decorator `checked`; callers with checked arguments use the `kernel` wit
 from __future__ import annotations
 
 import functools
+import importlib
 import inspect
 import math
 from collections.abc import Callable
@@ -262,3 +263,15 @@ def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) ->
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
     return value
+
+
+def imported(name: str, path: str) -> Callable[..., Any]:
+    """Return the function of ``"module:function"``, or raise ValueError with the name."""
+    module, _, attribute = path.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{name} {path!r:.80} cannot be imported: {error}") from error
+    if not callable(found):
+        raise ValueError(f"{name} {path!r:.80} must be callable, got {found!r:.80}")
+    return found

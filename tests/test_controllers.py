@@ -59,8 +59,8 @@ def test_selection_actions_are_legal_and_follow_the_generator(arguments, name):
             scores = AnchorSelectionVectorEnv(4, k=2)
             scores.reset(seed=1)
             if env.seen is not None and not env.seen["links"].any():
-                chosen = scores._choice(controller(scores, np.random.default_rng(7)))
-                np.testing.assert_array_equal(env._choice(actions), chosen)
+                chosen = scores._command(controller(scores, np.random.default_rng(7)))
+                np.testing.assert_array_equal(env._command(actions), chosen)
         else:
             assert np.abs(actions).max() <= 1
         env.step(actions)

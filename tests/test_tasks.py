@@ -435,7 +435,7 @@ def test_craft_numbers_change_nothing_when_sorted(sort):
     env.reset(seed=3)
     env.seen = other
     env._show(other, env.scene)
-    renumbered = env._velocities(actions).reshape(8, 4, 3)
+    renumbered = env._command(actions).reshape(8, 4, 3)
     env.seen = seen
     # The same craft get the same commands, whatever their numbers.
     back = np.argsort(turn)

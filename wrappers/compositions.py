@@ -8,29 +8,36 @@ environment.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.envs.batch import StatedLength
+from rbl_gym.envs.batch import StatedLength, check_actions
 from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
-from rbl_gym.wrappers.estimate import scene_of
+from rbl_gym.wrappers.estimate import EstimatePose, FilterLike, scene_of
 from rbl_gym.wrappers.observations import Seen, Viewer, ViewLike, viewer_of
+from rbl_gym.wrappers.rewards import RewardLike
+from rbl_gym.wrappers.task_worlds import filter_of_task
+from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
 
 class Task(StatedLength):
     """Base of scalar and vector tasks. In the vector form arrays have leading axes (B,).
 
-    A subclass implements `_command` and `_show`, and `_price` if actions have a cost.
+    A subclass implements `_spaces`, `_command` and `_show`; `_below` if a wrapper lies between the
+    environment and the filter, and `_price` if actions have a cost. Its ``__init__`` sets `scene`
+    and `family`, then calls `_compose`.
 
     Attributes
     ----------
@@ -85,13 +92,27 @@ class Task(StatedLength):
             raise gym.error.ResetNeeded("call reset() before step()")
         return self.seen
 
-    def _command(self, action: Any) -> Any:
-        """Return the action of `inner`; raises ValueError for an invalid action."""
+    def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        """Return the spaces of the task's own view and of the actions, of one world."""
+        raise NotImplementedError
+
+    def _below(self, env: Any) -> Any:
+        """Return the environment whose measurements the filter gets."""
+        return env
+
+    def _command(self, action: np.ndarray) -> Any:
+        """Return the action of `inner` for a valid action of the task."""
         raise NotImplementedError
 
     def _show(self, observation: dict[str, np.ndarray], world: Any) -> np.ndarray:
         """Return the policy's view of an observation of `inner` in a `Scene` or `StackedScenes`."""
         raise NotImplementedError
+
+    @property
+    def _worlds(self) -> dict[str, Any]:
+        """The arguments of the environment."""
+        worlds = {"scene": self.scene} if self.family is None else {"scenes": self.family}
+        return {**worlds, "reward": "none"}
 
     def _look_by(self, observation: ViewLike, hides_obstacles: bool = False) -> None:
         """Set how the policy observes the belief; ``"flat"`` is the task's own view."""
@@ -141,9 +162,19 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
 
     metadata: dict[str, Any] = TrackingEnv.metadata
 
-    def _compose(self, inner: gym.Env[Any, Any]) -> None:
-        self.inner, self.render_mode = inner, inner.render_mode
-        self.observation_space = self._space_of(self.observation_space, inner)
+    def _compose(
+        self,
+        filter: FilterLike,
+        options: Mapping[str, Any] | None,
+        reward: RewardLike,
+        render_mode: str | None,
+    ) -> None:
+        """Make the stack and the spaces."""
+        own, self.action_space = self._spaces()
+        env = self._below(TrackingEnv(**self._worlds, render_mode=render_mode))
+        self.inner = EstimatePose(env, *filter_of_task(filter, options), reward)
+        self.render_mode = render_mode
+        self.observation_space = self._space_of(own, self.inner)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -156,6 +187,8 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the world and its filter."""
+        self._told()
+        action = check_actions("action", action, self.action_space)
         self.seen, reward, *ended, info = self.inner.step(self._command(action))
         return self._shown(), float(reward - self._price(info)), *ended, info
 
@@ -167,10 +200,26 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
 class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """`num_envs` worlds of a task; seeding and autoreset as `BatchEnv`."""
 
-    def _compose(self, inner: VectorEnv[Any, Any, Any]) -> None:
-        self.inner, self.num_envs = inner, inner.num_envs
-        self.metadata, self.render_mode = inner.metadata, inner.render_mode
-        self.single_observation_space = self._space_of(self.single_observation_space, inner)
+    def _compose(
+        self,
+        num_envs: int,
+        filter: FilterLike,
+        options: Mapping[str, Any] | None,
+        reward: RewardLike,
+        render_mode: str | None,
+        max_episode_steps: int | None,
+        autoreset_mode: str | AutoresetMode,
+    ) -> None:
+        """Make the stack and the spaces."""
+        own, self.single_action_space = self._spaces()
+        envs = TrackingVectorEnv(
+            num_envs, **self._worlds, render_mode=render_mode,
+            max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
+        )  # fmt: skip
+        below = self._below(envs)
+        self.inner = VectorEstimatePose(below, *filter_of_task(filter, options), reward)
+        self.num_envs, self.metadata, self.render_mode = envs.num_envs, envs.metadata, render_mode
+        self.single_observation_space = self._space_of(own, self.inner)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -183,7 +232,9 @@ class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIn
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Step every world and its filter."""
+        self._told()
         world = self.world
+        actions = check_actions("actions", actions, self.single_action_space, self.num_envs)
         self.seen, reward, *ended, info = self.inner.step(self._command(actions))
         price = self._price(info)
         if "final_obs" in info:

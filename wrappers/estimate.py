@@ -222,34 +222,45 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
     law = getattr(env.unwrapped, "noise", scene.noise)
     if isinstance(law, AngleNoise):
         told = {"measurement": "doa", **told}
+    return scene_filter(scene, name, told, law)
+
+
+def scene_filter(scene: Scene, name: str, options: Mapping[str, Any], noise: Any = None) -> Filter:
+    """Return a named filter with the tags and laws of the scene; `noise` replaces that of ranges.
+
+    Raises
+    ------
+    ValueError
+        As in `estimators.make`, and if the filter does not support a law per epoch, which scenes
+        with obstacles need, or reads an inertial sensor that the scene does not have.
+    """
+    name, options = parse_filter(name, options)
     filter = estimators.make(
         name,
         tags=scene.body,
-        noise=law,
+        noise=scene.noise if noise is None else noise,
         process=scene.process,
-        **{**scene.links.options, **inertial_options(name, scene), **told},
+        **{**scene.links.options, **_inertial_options(name, scene), **options},
     )
-    check_takes_obstacles(name, filter, scene)
-    check_reads(name, filter, scene)
+    if scene.weakens:
+        check_takes_noise(
+            name, filter, "the scene's obstacles change the noise from epoch to epoch"
+        )
+    if reads(filter) == "inertial" and scene.inertial is None:
+        raise ValueError(
+            f"filter {name!r} reads an inertial sensor, scene {scene.name!r} has none: give it "
+            'one, scene={"name": ..., "inertial": "consumer"}'
+        )
     return filter
 
 
-def inertial_options(name: str, scene: Scene) -> dict[str, Any]:
+def _inertial_options(name: str, scene: Scene) -> dict[str, Any]:
     """Return options for a filter with an inertial sensor, if the scene has one."""
     if scene.inertial is None:
         return {}
     asked = inspect.signature(factory_of(name)).parameters
     known = {"inertial": scene.inertial, "speed_m_s": scene.speed_std_m_s}
     return known if "inertial" in asked else {}
-
-
-def check_reads(name: str, filter: Filter, scene: Scene) -> None:
-    """Raise ValueError if a filter needs an inertial sensor that the scene does not have."""
-    if reads(filter) == "inertial" and scene.inertial is None:
-        raise ValueError(
-            f"filter {name!r} reads an inertial sensor, scene {scene.name!r} has none: give it "
-            'one, scene={"name": ..., "inertial": "consumer"}'
-        )
 
 
 def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -264,14 +275,6 @@ def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
                 f"options must not have {key!r}, which the wrapper sets, got {options!r:.80}"
             )
     return dict(options)
-
-
-def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
-    """Raise ValueError if obstacles vary the noise law and the filter does not support that."""
-    if scene.weakens:
-        check_takes_noise(
-            name, filter, "the scene's obstacles change the noise from epoch to epoch"
-        )
 
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

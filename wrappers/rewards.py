@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds
-from rbl_gym.checks import FloatArray, all_finite, check_number
-from rbl_gym.envs.custom import imported
+from rbl_gym.checks import FloatArray, all_finite, check_number, imported
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.metrics import Figures
 from rbl_gym.worlds.scene import Scene

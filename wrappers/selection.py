@@ -7,31 +7,20 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym.checks import BoolArray, check_count, check_number, check_one_of
-from rbl_gym.envs.batch import check_actions
-from rbl_gym.envs.tracking import TrackingEnv
-from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers import views
 from rbl_gym.wrappers.compositions import Task, TaskEnv, VectorTaskEnv
-from rbl_gym.wrappers.estimate import EstimatePose, FilterLike
+from rbl_gym.wrappers.estimate import FilterLike
 from rbl_gym.wrappers.observations import ViewLike
 from rbl_gym.wrappers.rewards import RewardLike
 from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
-from rbl_gym.wrappers.task_worlds import (
-    LIMIT,
-    Usual,
-    family_of_task,
-    filter_of_task,
-    made_of,
-    world_of,
-    worlds_of,
-)
-from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
+from rbl_gym.wrappers.task_worlds import LIMIT, Usual, family_of_task, world_of, worlds_of
 
 SELECTIONS = ("top-k", "priced", "subset")
 # Limit of the number of subsets.
@@ -70,12 +59,13 @@ class _AnchorSelection(Task):
             action = spaces.MultiBinary(m)
         return spaces.Box(-LIMIT, LIMIT, (size,), np.float32), action
 
-    @property
-    def _remembers(self) -> bool:
-        """Return whether the observation has the memory of the anchors."""
-        return self.family is not None or self._viewer is not None
+    def _below(self, env: Any) -> Any:
+        """Return the environment with a choice of anchors, remembered if the view shows it."""
+        remembers = self.family is not None or self._viewer is not None
+        form: Any = SelectAnchors if isinstance(env, gym.Env) else VectorSelectAnchors
+        return form(env, remembers)
 
-    def _choice(self, action: np.ndarray) -> BoolArray:
+    def _command(self, action: np.ndarray) -> BoolArray:
         """Return whether an action chooses each anchor (..., M); ties go to the lower number."""
         there = None if self.family is None else self._told()["anchor_mask"].astype(np.bool_)
         if self._subsets is not None:
@@ -155,18 +145,9 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
     ) -> None:
         self._configure(mode, k, price, scene, scenes)
         self._look_by(observation, hides_obstacles=True)
-        self.single_observation_space, self.single_action_space = self._spaces()
-        envs = TrackingVectorEnv(
-            num_envs, **made_of(self), render_mode=render_mode,
-            max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
-        )  # fmt: skip
-        selected = VectorSelectAnchors(envs, self._remembers)
-        self._compose(VectorEstimatePose(selected, *filter_of_task(filter, options), reward))
-
-    def _command(self, action: Any) -> BoolArray:
-        self._told()
-        space = self.single_action_space
-        return self._choice(check_actions("actions", action, space, self.num_envs))
+        self._compose(
+            num_envs, filter, options, reward, render_mode, max_episode_steps, autoreset_mode
+        )
 
 
 class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
@@ -252,14 +233,7 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     ) -> None:
         self._configure(mode, k, price, scene, scenes)
         self._look_by(observation, hides_obstacles=True)
-        self.observation_space, self.action_space = self._spaces()
-        world = TrackingEnv(**made_of(self), render_mode=render_mode)
-        env = SelectAnchors(world, self._remembers)
-        self._compose(EstimatePose(env, *filter_of_task(filter, options), reward))
-
-    def _command(self, action: Any) -> BoolArray:
-        self._told()
-        return self._choice(check_actions("action", action, self.action_space))
+        self._compose(filter, options, reward, render_mode)
 
 
 def _subsets(m: int, k: int) -> BoolArray:

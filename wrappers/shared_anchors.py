@@ -22,6 +22,7 @@ from rbl_gym.envs.batch import (
     reset_mask,
     seeds_of,
 )
+from rbl_gym.envs.scalar import first_of, scalars_of
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily
@@ -303,14 +304,14 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
         check_options(options)
         super().reset(seed=seed)
         observation, info = self._one.reset(seed=None if seed is None else [seed])
-        return _first(observation), _first_of_infos(info)
+        return first_of(observation), _informed(info)
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move the anchors, then all bodies, then measure."""
         action = check_actions("action", action, self.action_space)
         observation, reward, terminated, truncated, info = self._one.step(action[None])
         ended = bool(terminated[0]), bool(truncated[0])
-        return _first(observation), float(reward[0]), *ended, _first_of_infos(info)
+        return first_of(observation), float(reward[0]), *ended, _informed(info)
 
     def render(self) -> Any:
         """Return the frames of the bodies side by side, (height, K width, 3), uint8."""
@@ -349,17 +350,6 @@ def family_of_bodies(scene: Any, bodies: Any) -> SceneFamily:
     return SceneFamily(merged)
 
 
-def _first(observation: Any) -> Any:
-    """Return the observation of the only world."""
-    if isinstance(observation, dict):
-        return {key: field[0] for key, field in observation.items()}
-    return observation[0]
-
-
-def _first_of_infos(info: dict[str, Any]) -> dict[str, Any]:
-    """Return the infos of the only world."""
-    return {
-        key: field.item(0) if field.ndim == 1 else field[0]
-        for key, field in info.items()
-        if not key.startswith("_")
-    }
+def _informed(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the infos of the only world, without the masks."""
+    return scalars_of({key: field for key, field in info.items() if not key.startswith("_")})

@@ -37,12 +37,6 @@ def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> Scene
     return family([{**defaults, **one} if isinstance(one, Mapping) else one for one in members])
 
 
-def made_of(task: Any) -> dict[str, Any]:
-    """Return the arguments of the environment of a task."""
-    worlds = {"scene": task.scene} if task.family is None else {"scenes": task.family}
-    return {**worlds, "reward": "none"}
-
-
 class Usual:
     """Usual values of a scene, or the largest of a family: variances of the prior, speed."""
 

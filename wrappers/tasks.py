@@ -15,25 +15,13 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym.checks import FloatArray, check_one_of
-from rbl_gym.envs.batch import check_actions
-from rbl_gym.envs.tracking import TrackingEnv
-from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers import views
 from rbl_gym.wrappers.compositions import Task, TaskEnv, VectorTaskEnv
-from rbl_gym.wrappers.estimate import EstimatePose, FilterLike
+from rbl_gym.wrappers.estimate import FilterLike
 from rbl_gym.wrappers.observations import ViewLike
 from rbl_gym.wrappers.rewards import RewardLike
-from rbl_gym.wrappers.task_worlds import (
-    LIMIT,
-    Usual,
-    family_of_task,
-    filter_of_task,
-    made_of,
-    world_of,
-    worlds_of,
-)
-from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
+from rbl_gym.wrappers.task_worlds import LIMIT, Usual, family_of_task, world_of, worlds_of
 
 DIFFICULTIES: dict[str, dict[str, Any]] = {
     "easy": {"n_anchors": 3, "anchor_speed_m_s": 4.0},
@@ -71,12 +59,12 @@ class _MobileAnchors(Task):
             spaces.Box(-1.0, 1.0, (2 * m,), np.float32),
         )
 
-    def _velocities(self, level: FloatArray) -> FloatArray:
+    def _command(self, action: FloatArray) -> FloatArray:
         """Return actions of the world (..., 3 M) from ordered horizontal velocities (..., 2 M)."""
-        batch, m = level.shape[:-1], self._n_craft
+        batch, m = action.shape[:-1], self._n_craft
         velocity = np.zeros((*batch, m, 3))
         # Action k is that of the k-th craft in the observation.
-        velocity[(*worlds_of(batch), self.order, slice(2))] = level.reshape(*batch, m, 2)
+        velocity[(*worlds_of(batch), self.order, slice(2))] = action.reshape(*batch, m, 2)
         return velocity.reshape(*batch, 3 * m)
 
     def _view_of(self, observation: dict[str, np.ndarray], world: Any) -> Any:
@@ -123,17 +111,9 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
     ) -> None:
         self._configure(difficulty, scene, sort_craft, scenes)
         self._look_by(observation)
-        self.single_observation_space, self.single_action_space = self._spaces()
-        envs = TrackingVectorEnv(
-            num_envs, **made_of(self), render_mode=render_mode,
-            max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
-        )  # fmt: skip
-        self._compose(VectorEstimatePose(envs, *filter_of_task(filter, options), reward))
-
-    def _command(self, action: Any) -> FloatArray:
-        self._told()
-        space = self.single_action_space
-        return self._velocities(check_actions("actions", action, space, self.num_envs))
+        self._compose(
+            num_envs, filter, options, reward, render_mode, max_episode_steps, autoreset_mode
+        )
 
 
 class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
@@ -212,10 +192,4 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     ) -> None:
         self._configure(difficulty, scene, sort_craft, scenes)
         self._look_by(observation)
-        self.observation_space, self.action_space = self._spaces()
-        env = TrackingEnv(**made_of(self), render_mode=render_mode)
-        self._compose(EstimatePose(env, *filter_of_task(filter, options), reward))
-
-    def _command(self, action: Any) -> FloatArray:
-        self._told()
-        return self._velocities(check_actions("action", action, self.action_space))
+        self._compose(filter, options, reward, render_mode)

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from rbl_gym.checks import all_finite
+from rbl_gym.checks import all_finite, imported
 
 # Values without bounds. These bounds are finite and never reached.
 FAR = 1e9
-
-
-def imported(name: str, path: str) -> Callable[..., Any]:
-    """Return the function of ``"module:function"``; a ValueError names the argument `name`."""
-    module, _, attribute = path.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{name} {path!r:.80} cannot be imported: {error}") from error
-    if not callable(found):
-        raise ValueError(f"{name} {path!r:.80} must be callable, got {found!r:.80}")
-    return found
 
 
 def chosen_view(observation: Any, names: tuple[str, ...]) -> tuple[str, Any]:

@@ -61,8 +61,8 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
         batch._epochs[0], batch._done[0] = 0, False
         start = batch._restart(_FIRST, batch._generators) or {}
         batch._shoot()
-        info = {**_scalars(batch._inform()), **_scalars(start)}
-        return _first(batch._observe()), info
+        info = {**scalars_of(batch._inform()), **scalars_of(start)}
+        return first_of(batch._observe()), info
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one step."""
@@ -77,17 +77,17 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
         truncated = not terminated and bool(batch._epochs[0] >= batch.steps_limit)
         batch._done[0] = terminated or truncated
         batch._shoot()
-        observation, info = _first(batch._observe()), _scalars(batch._inform())
+        observation, info = first_of(batch._observe()), scalars_of(batch._inform())
         return observation, float(reward[0]), terminated, truncated, info
 
 
-def _first(observation: Observation) -> Observation:
+def first_of(observation: Observation) -> Observation:
     """Return the observation of the first world, not copied."""
     if isinstance(observation, dict):
         return {key: value[0] for key, value in observation.items()}
     return observation[0]
 
 
-def _scalars(info: dict[str, Any]) -> dict[str, Any]:
+def scalars_of(info: dict[str, Any]) -> dict[str, Any]:
     """Return infos of the only world, with Python numbers."""
     return {key: value.item(0) if value.ndim == 1 else value[0] for key, value in info.items()}

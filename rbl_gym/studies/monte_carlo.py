@@ -15,7 +15,7 @@ from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.studies.epochs import Reading, Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
-from rbl_gym.wrappers.estimate import check_reads, check_takes_obstacles, inertial_options
+from rbl_gym.wrappers.estimate import scene_filter
 
 __all__ = [
     "SimulatedTrials",
@@ -163,25 +163,6 @@ def told_reading(
     law = None if quality is None else WeakenedNoise(told.noise, quality)
     twist, inertial = (None, None) if first else (at.twist, at.readings)
     return Reading(measured.ranges, anchors, measured.links, law, twist, told.dt, inertial)
-
-
-def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
-    """Return a named filter with the tags and laws of the scene.
-
-    Raises
-    ------
-    ValueError
-        As in `estimators.make`, and if the filter does not support a law per epoch, which scenes
-        with obstacles need.
-    """
-    name, options = estimators.parse_filter(name, options)
-    options = {**scene.links.options, **inertial_options(name, scene), **options}
-    filter = estimators.make(
-        name, tags=scene.tags, noise=scene.noise, process=scene.process, **options
-    )
-    check_takes_obstacles(name, filter, scene)
-    check_reads(name, filter, scene)
-    return filter
 
 
 def trial_steps(trials: SimulatedTrials, filter: estimators.Filter) -> Iterator[Step]:

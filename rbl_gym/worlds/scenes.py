@@ -8,13 +8,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import as_tuples, check_array, check_one_of
+from rbl_gym.checks import as_tuples, check_array, check_one_of, imported
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
@@ -229,7 +228,9 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     if "layout" in scene:
         if "anchors" in changes:
             raise ValueError("scene must have either anchors or layout, got both")
-        changes["anchors"] = as_tuples(_entry_point(READERS[".csv"])(scene["layout"]).positions)
+        changes["anchors"] = as_tuples(
+            imported("layout", READERS[".csv"])(scene["layout"]).positions
+        )
     if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
         changes.setdefault("anchors", None)
     anchors = changes.get("anchors")
@@ -244,13 +245,8 @@ def _named(name: Any) -> Scene:
     """Return a scene by its name or by the path of its file."""
     suffix = PurePath(name).suffix.lower() if isinstance(name, str) else ""
     if suffix in READERS and name not in SCENES:
-        return _entry_point(READERS[suffix])(name)
+        return imported("scene", READERS[suffix])(name)
     return SCENES[check_one_of("scene", name, list(SCENES))]
-
-
-def _entry_point(name: str) -> Any:
-    module, _, attribute = name.partition(":")
-    return getattr(import_module(module), attribute)
 
 
 def _stretched(scene: Scene, stretch: Any) -> Scene:
