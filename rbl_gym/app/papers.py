@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
+
+from rbl_gym.recordings.writing import write_table
 
 
 class Experiment(NamedTuple):
@@ -101,11 +101,8 @@ def write_csv(result: dict[str, Any], path: str) -> None:
     """Write every figure of a result as a row: its path in the result, then the value."""
     rows = list(_leaves(result, ()))
     width = max(len(place) for place, _ in rows)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*(f"key{k}" for k in range(1, width + 1)), "value"])
-        writer.writerows([*place, *[""] * (width - len(place)), value] for place, value in rows)
+    header = [*(f"key{k}" for k in range(1, width + 1)), "value"]
+    write_table(path, header, ([*at, *[""] * (width - len(at)), value] for at, value in rows))
 
 
 def _leaves(node: Any, place: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], Any]]:

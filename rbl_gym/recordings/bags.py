@@ -6,7 +6,6 @@ used. Bags of ROS 1 and MCAP store them, and so do sqlite3 bags since ROS 2 Iron
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import shlex
@@ -19,6 +18,7 @@ import numpy as np
 from rbl_gym.recordings import bag_fields, bag_profiles, bag_reading
 from rbl_gym.recordings.bag_reading import Advance, AnyPath, Paths, log_name
 from rbl_gym.recordings.bag_tables import Sheet, Tables, make_tables, seconds
+from rbl_gym.recordings.writing import write_table
 
 __all__ = ["convert_bag", "list_topics", "show_message"]
 
@@ -225,12 +225,8 @@ def _write(out: Path, sheets: Mapping[str, Sheet]) -> dict[str, str]:
             f"{out / stale[0]} exists and does not come from this log: remove it or choose "
             "another folder"
         )
-    out.mkdir(parents=True, exist_ok=True)
     for name, sheet in sheets.items():
-        with (out / name).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(sheet.header)
-            writer.writerows(sheet.rows)
+        write_table(out / name, sheet.header, sheet.rows)
     return {name: os.fspath(out / name) for name in sheets}
 
 

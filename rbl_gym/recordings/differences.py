@@ -14,7 +14,7 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.measurements import offsets
 from rbl_gym.recordings.format import Format
-from rbl_gym.recordings.measured import Measured, ids_of, judge, scale_of
+from rbl_gym.recordings.measured import Measured, ids_of, judge, measured_of, scale_of
 from rbl_gym.recordings.points import Points
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import Ids, IntArray, Table
@@ -41,27 +41,13 @@ def read_differences(
     table.require("t", "anchor_a", "anchor_b", "difference")
     if anchors is None:
         raise ValueError(f"{table.path}: time differences need a table of anchors")
-    read = {"t", "anchor_a", "anchor_b", "difference", "tag", "run"}
     ids = anchors.ids, ids_of(table, "tag", tags)
     scale = scale_of(table, "difference", format, said)
-    values = scale * table.numbers("difference", may_be_missing=True)
     first, other = (table.positions(name, ids[0]) for name in ("anchor_a", "anchor_b"))
-    none = np.zeros(len(values), dtype=np.intp)
-    tag = table.positions("tag", ids[1]) if "tag" in table.columns else none
-    std, column = None, next((c for c in ("std", "var") if c in table.columns), "")
-    if column:
-        read.add(column)
-        std = table.numbers(column, may_be_missing=True)
-        with np.errstate(invalid="ignore"):
-            std = scale * (np.sqrt(std) if column == "var" else std)
-    rows = np.arange(len(values))
-    measured = Measured(rows, none, first, tag, values, std, none.copy(), ["difference"], [column])
-    if "valid" in table.columns:
-        read.add("valid")
-        valid = table.numbers("valid")
-        table.check(np.isin(valid, (0, 1)), "valid", "must be 0 or 1")
-        measured.drop(valid == 0, "marked as not valid")
-    said.read(table, read)
+    tag = table.positions("tag", ids[1]) if "tag" in table.columns else np.zeros_like(first)
+    measured = measured_of(table, "difference", first, tag, scale)
+    read = "t", "anchor_a", "anchor_b", "difference", "tag", "run", "valid"
+    said.read(table, {*read, *measured.std_columns})
     measured.drop(other < 0, "to an unknown anchor")
     measured.drop((first == other) & (first >= 0), "of an anchor to itself")
     judge(measured, table, signed=True)

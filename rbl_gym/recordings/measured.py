@@ -102,25 +102,34 @@ def read_measured(
         for column, known in zip(("anchor", "tag"), ids, strict=True)
     )
     read |= {"anchor", "tag"}
-    scale = scale_of(table, "range", format, said)
-    values = scale * table.numbers("range", may_be_missing=True)
+    measured = measured_of(table, "range", anchor, tag, scale_of(table, "range", format, said))
+    said.read(table, {*read, "valid", *measured.std_columns})
+    judge(measured, table, format.offset is not None)
+    return measured, ids
+
+
+def measured_of(
+    table: Table, column: str, anchor: IntArray, tag: IntArray, scale: float
+) -> Measured:
+    """Return the values of a column, with ``std`` or ``var`` and ``valid``, if the table has them.
+
+    `scale` is the length of a unit in metres, also of the deviations without a unit of their own.
+    """
+    values = scale * table.numbers(column, may_be_missing=True)
+    none = np.zeros(len(values), dtype=np.intp)
     std, std_column = None, next((c for c in ("std", "var") if c in table.columns), "")
     if std_column:
-        read.add(std_column)
         std = table.numbers(std_column, may_be_missing=True)
         with np.errstate(invalid="ignore"):
             std = np.sqrt(std) if std_column == "var" else std
         std *= METRES[table.unit(std_column, METRES)] if table.units.get(std_column) else scale
     rows = np.arange(len(values))
-    measured = Measured(rows, none, anchor, tag, values, std, none.copy(), ["range"], [std_column])
+    measured = Measured(rows, none, anchor, tag, values, std, none.copy(), [column], [std_column])
     if "valid" in table.columns:
-        read.add("valid")
         valid = table.numbers("valid")
         table.check(np.isin(valid, (0, 1)), "valid", "must be 0 or 1")
         measured.drop(valid == 0, "marked as not valid")
-    said.read(table, read)
-    judge(measured, table, format.offset is not None)
-    return measured, ids
+    return measured
 
 
 def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:

@@ -1,9 +1,10 @@
-"""Write and read track files: TUM, which other tools read, or CSV with covariance."""
+"""Write tables, and write and read tracks: TUM, which other tools read, or CSV with covariance."""
 
 from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,6 +52,15 @@ class TrackFile(NamedTuple):
     nis: FloatArray | None = None
     dof: NDArray[np.int64] | None = None
     rank: NDArray[np.int64] | None = None
+
+
+def write_table(path: AnyPath, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a CSV file with one header line; its folder is created."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
 
 
 def check_track_path(path: AnyPath) -> None:
@@ -105,10 +115,7 @@ def write_track(path: AnyPath, track: TrackFile) -> None:
         if value is not None:
             names.append(name)
             cells.append([x if np.isfinite(x) else "" for x in _column(name, value, len(times))])
-    with open(path, "w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows(zip(*cells, strict=True))
+    write_table(path, names, zip(*cells, strict=True))
 
 
 def _column(name: str, value: ArrayLike, count: int) -> list[float]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +11,7 @@ from numpy.typing import ArrayLike
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements.direction_bias import DirectionLaw
+from rbl_gym.recordings.writing import write_table
 
 __all__ = ["write_directions", "write_frame", "write_link_table", "write_points"]
 
@@ -37,7 +36,7 @@ def write_link_table(
     told
         (M, N) links with a row.
     """
-    _write(
+    write_table(
         path,
         ("anchor", "tag", *columns),
         [
@@ -66,7 +65,7 @@ def write_points(
         Names, and positions (n, 3) in metres.
     """
     rows = [[name, *(f"{x:.6f}" for x in place)] for name, place in zip(ids, places, strict=True)]
-    _write(path, (kind, "x", "y", "z"), rows)
+    write_table(path, (kind, "x", "y", "z"), rows)
 
 
 def write_directions(
@@ -99,7 +98,7 @@ def write_directions(
                 for name, row, factor in zip(names, bias, log_std, strict=True)
             ]
     header = ("end", "id", "harmonic", "bias_cos_m", "bias_sin_m", "log_std_cos", "log_std_sin")
-    _write(path, header, rows)
+    write_table(path, header, rows)
 
 
 def write_frame(path: str | os.PathLike[str], rotation: FloatArray) -> None:
@@ -112,14 +111,6 @@ def write_frame(path: str | os.PathLike[str], rotation: FloatArray) -> None:
     rotation
         ``turn.rotation`` from `calibrate_inertial`.
     """
-    _write(path, ("qw", "qx", "qy", "qz"), [[f"{x:.8f}" for x in rotations.quaternion(rotation)]])
-
-
-def _write(
-    path: str | os.PathLike[str], header: Sequence[str], rows: Iterable[Iterable[object]]
-) -> None:
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
+    write_table(
+        path, ("qw", "qx", "qy", "qz"), [[f"{x:.8f}" for x in rotations.quaternion(rotation)]]
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -15,6 +14,7 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.polygons import area, contains
 from rbl_gym.placement.plans.drawing import UNITS
 from rbl_gym.placement.scene_files import Problem
+from rbl_gym.recordings.writing import write_table
 
 __all__ = ["LAYER", "SUFFIXES", "mounting_list", "write_layout"]
 
@@ -178,13 +178,12 @@ def write_layout(
 def _write_csv(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
     columns = [key for key in rows[0] if key != "corners"]
     ends = [f"{key}_{n}" for n in (1, 2) for key in ("corner_x_m", "corner_y_m", "distance_m")]
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*columns, *ends])
-        for row in rows:
-            values = [value for corner in row["corners"] for value in corner.values()]
-            values += [""] * (len(ends) - len(values))
-            writer.writerow([*(row[key] for key in columns), *values])
+    cells = []
+    for row in rows:
+        values = [value for corner in row["corners"] for value in corner.values()]
+        values += [""] * (len(ends) - len(values))
+        cells.append([*(row[key] for key in columns), *values])
+    write_table(path, [*columns, *ends], cells)
 
 
 def _write_geojson(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
