@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, kernel
@@ -55,6 +56,16 @@ class AugmentedState(NamedTuple):
     translation: FloatArray
     extra: FloatArray
     covariance: FloatArray
+
+
+def extended(state: AugmentedState, *blocks: FloatArray) -> AugmentedState:
+    """Return the state with further extra states of zero; a covariance (n, n) for each block."""
+    more, n = block_diag(*blocks), state.covariance.shape[-1]
+    batch, total = state.extra.shape[:-1], n + len(more)
+    P = np.zeros((*batch, total, total))
+    P[..., :n, :n], P[..., n:, n:] = state.covariance, more
+    extra = np.concatenate([state.extra, np.zeros((*batch, len(more)))], axis=-1)
+    return state._replace(extra=extra, covariance=P)
 
 
 @dataclass(frozen=True, eq=False)

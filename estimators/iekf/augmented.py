@@ -104,12 +104,9 @@ class AugmentedEkf:
             As in `IteratedEkf.initial`.
         """
         pose = self.pose.initial(rotation, translation, covariance)
-        batch, std = pose.translation.shape[:-1], self._prior_std
-        n = 6 + len(std)
-        P = np.zeros((*batch, n, n))
-        P[..., :6, :6] = pose.covariance
-        P[..., range(6, n), range(6, n)] = std**2
-        return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, n - 6)), P)
+        nothing = np.zeros((*pose.translation.shape[:-1], 0))
+        alone = AugmentedState(pose.rotation, pose.translation, nothing, pose.covariance)
+        return bias_cost.extended(alone, np.diag(self._prior_std**2))
 
     def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:
         """Return the state after `dt` seconds.
@@ -230,15 +227,7 @@ class AugmentedEkf:
                 f"the number of anchors must be {have // len(self.biases) // n_tags}, as the "
                 f"state holds that many biases of each tag, got {shape[0]}"
             )
-        batch, n = state.extra.shape[:-1], state.covariance.shape[-1]
-        total = n + links * len(self.biases)
-        P = np.zeros((*batch, total, total))
-        P[..., :n, :n] = state.covariance
-        for k, law in enumerate(self.biases):
-            block = slice(n + k * links, n + (k + 1) * links)
-            P[..., block, block] = law.covariance(links)
-        extra = np.concatenate([state.extra, np.zeros((*batch, total - n))], axis=-1)
-        return state._replace(extra=extra, covariance=P)
+        return bias_cost.extended(state, *(law.covariance(links) for law in self.biases))
 
     def _found_from_nothing(
         self,

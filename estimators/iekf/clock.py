@@ -174,8 +174,8 @@ class ClockEkf(AugmentedEkf):
     ) -> AugmentedState:
         """Return the state with biases and clocks, from ranges minus distances (..., M, N)."""
         guess = offsets.median(gaps, there, self.clock.offset)
-        shape = gaps.shape[-2:]
-        biases = len(self.biases) * shape[0] * shape[1]
+        links = gaps.shape[-2] * gaps.shape[-1]
+        biases = len(self.biases) * links
         n = guess.shape[-2] * guess.shape[-1]
         have, first = state.extra.shape[-1], self._n_twist
         if have == first + biases + 2 * n:
@@ -185,16 +185,9 @@ class ClockEkf(AugmentedEkf):
             raise ValueError(
                 f"the number of anchors must be {held}, the number of clocks in the state, got {n}"
             )
-        batch, start = guess.shape[:-2], 6 + first
-        total = start + biases + 2 * n
-        P = np.zeros((*batch, total, total))
-        P[..., :start, :start] = state.covariance
-        for k, law in enumerate(self.biases):
-            block = slice(start + k * shape[0] * shape[1], start + (k + 1) * shape[0] * shape[1])
-            P[..., block, block] = law.covariance(shape[0] * shape[1])
-        std = np.repeat([self.clock.std_m, self.clock.drift_m_s], n)
-        P[..., range(total - 2 * n, total), range(total - 2 * n, total)] = std**2
-        extra = np.zeros((*batch, total - 6))
-        extra[..., :first] = state.extra
+        clocks = np.diag(np.repeat([self.clock.std_m, self.clock.drift_m_s], n) ** 2)
+        state = bias_cost.extended(state, *(law.covariance(links) for law in self.biases), clocks)
+        batch = guess.shape[:-2]
+        extra = np.broadcast_to(state.extra, (*batch, state.extra.shape[-1])).copy()
         extra[..., first + biases : first + biases + n] = guess.reshape((*batch, n))
-        return AugmentedState(state.rotation, state.translation, extra, P)
+        return state._replace(extra=extra)

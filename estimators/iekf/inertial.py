@@ -90,12 +90,7 @@ class InertialEkf(AugmentedEkf):
             If a shape is wrong, a value is NaN, or a time is negative.
         """
         readings = check_array("readings", readings, ("S", 6))
-        if isinstance(dt, list | tuple) or getattr(dt, "ndim", 0):
-            steps = navigation.check_steps(dt, readings, "dt")
-        else:
-            count = readings.shape[-2]
-            steps = np.full(count, check_number("dt", dt, low=0.0) / count)
-        state = plain(state)
+        steps, state = navigation.steps_of(dt, readings), plain(state)
         check_batches(state=state.translation.shape[:-1], readings=readings.shape[:-2])
         moved = navigation.propagate(*state, readings, steps, self._law)
         if any(law.time_s is not None for law in self.biases):

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_number, kernel
+from rbl_gym.checks import FloatArray, kernel
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.iekf.inertial import fade
@@ -90,12 +90,7 @@ class OdometryEkf(AugmentedEkf):
             raise ValueError(
                 f"readings must be finite or NaN and (..., S, 6), got shape {readings.shape}"
             )
-        if np.ndim(dt):
-            steps = navigation.check_steps(dt, readings)
-        else:
-            count = readings.shape[-2]
-            steps = np.full(count, check_number("dt", dt, low=0.0) / max(count, 1))
-        state = plain(state)
+        steps, state = navigation.steps_of(dt, readings), plain(state)
         check_batches(state=state.translation.shape[:-1], readings=readings.shape[:-2])
         for k in range(readings.shape[-2]):
             step = steps[..., k]

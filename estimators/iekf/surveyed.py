@@ -151,9 +151,4 @@ class SurveyedEkf(AugmentedEkf):
             )
         std = anchor_deviations(self.anchor_std_m, anchors)
         std = np.zeros((anchors, 3)) if std is None else std
-        n, batch = state.covariance.shape[-1], state.extra.shape[:-1]
-        P = np.zeros((*batch, n + 3 * anchors, n + 3 * anchors))
-        P[..., :n, :n] = state.covariance
-        P[..., range(n, n + 3 * anchors), range(n, n + 3 * anchors)] = std.ravel() ** 2
-        extra = np.concatenate([state.extra, np.zeros((*batch, 3 * anchors))], axis=-1)
-        return state._replace(extra=extra, covariance=P)
+        return bias_cost.extended(state, np.diag(std.ravel() ** 2))

@@ -110,6 +110,14 @@ def check_steps(steps: ArrayLike, readings: FloatArray, name: str = "steps") -> 
     return steps if steps.ndim else np.full(count, steps)
 
 
+def steps_of(dt: ArrayLike, readings: FloatArray) -> FloatArray:
+    """Return durations (..., S) of samples: `dt` of each, or of an interval that they share."""
+    if isinstance(dt, list | tuple) or getattr(dt, "ndim", 0):
+        return check_steps(dt, readings, "dt")
+    count = readings.shape[-2]
+    return np.full(count, check_number("dt", dt, low=0.0) / max(count, 1))
+
+
 def integrate(
     readings: FloatArray, steps: FloatArray, bias: FloatArray, law: FloatArray
 ) -> Preintegrated:

@@ -109,7 +109,7 @@ def sample(problem: Problem, n_places: int = 1024, turns: int = 1, seed: int = 0
         np.concatenate(column) for column in zip(*rows, strict=True)
     )
     order = np.argsort(order, kind="stable")
-    prior = np.array([_prior(problem, zone) for zone in problem.zones])
+    prior = np.array([prior_of(problem, zone) for zone in problem.zones])
     zone = np.repeat(zone[order], turns)
     return Sample(
         rotation[order].reshape(-1, 3, 3),
@@ -128,8 +128,11 @@ def _turns(rng: np.random.Generator, zone: Zone, batch: tuple[int, ...]) -> Floa
     return rotations.exp(angle * np.array([0.0, 0.0, 1.0]))
 
 
-def _prior(problem: Problem, zone: Zone) -> FloatArray:
-    """Return prior information (6, 6): 60 degrees, half of the extent of all zones; known tilt."""
+def prior_of(problem: Problem, zone: Zone) -> FloatArray:
+    """Return the prior information (6, 6): 60 degrees, and half of the extent of all zones.
+
+    If only the heading is estimated, the tilt is known.
+    """
     extent = float(np.ptp(problem.corners(), axis=0).max())
     diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
     if zone.attitude == "heading":

@@ -12,8 +12,8 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import ATTITUDES, Problem, cube
-from rbl_gym.placement.gain import Gain
 from rbl_gym.placement.problem import Context, PlacementTask, positions
 from rbl_gym.placement.sample import sample
 from rbl_gym.placement.tokens import KINDS, Scenery

@@ -7,7 +7,6 @@ each set of unknowns. No filter is run: the bound is the limit of the best one.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from rbl_gym.bounds import inertial
 from rbl_gym.bounds.motions import Motion
 from rbl_gym.bounds.nuisances import information_of, with_epoch
 from rbl_gym.checks import FloatArray, check_count
-from rbl_gym.measurements.inertial import SENSORS, InertialSensor
+from rbl_gym.measurements.inertial import SENSORS
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.kinematics import ProcessNoise, twists_between
 from rbl_gym.motion.unknown_twist import WanderingTwist
@@ -26,6 +25,7 @@ from rbl_gym.studies import monte_carlo
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes, simulation
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.worlds.scene_bounds import felt_motion
 
 __all__ = ["SURVEYS_M", "UNCALIBRATED", "what_if"]
 
@@ -129,15 +129,10 @@ def _motions(drawn: monte_carlo.SimulatedTrials) -> dict[str, _Law]:
     for name, sensor in sensors.items():
         assert sensor is not None
         prior = inertial.prior_information(episode.prior_covariance, sensor, scene.speed_std_m_s)
-        found[f"{name} IMU"] = _Law(prior, 15, functools.partial(_sensed, scene.dt, sensor))
+        found[f"{name} IMU"] = _Law(
+            prior, 15, lambda at, _, sensor=sensor: felt_motion(at, scene.dt, sensor)
+        )
     return found
-
-
-def _sensed(dt: float, sensor: InertialSensor, at: simulation.Epoch, _: int) -> Motion:
-    assert at.readings is not None
-    assert at.bias is not None
-    felt = at.readings - at.bias[..., None, :]
-    return bounds.InertialMotion(felt, np.full(felt.shape[-2], dt / felt.shape[-2]), sensor)
 
 
 def _wandering(drawn: monte_carlo.SimulatedTrials) -> tuple[WanderingTwist, FloatArray]:

@@ -10,6 +10,7 @@ from rbl_gym.bounds.motions import Motion
 from rbl_gym.bounds.nuisances import information_of, with_epoch
 from rbl_gym.checks import BoolArray, FloatArray, all_finite
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.inertial import InertialSensor
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scene import Scene
 
@@ -100,12 +101,16 @@ def _motion_of(scene: Scene, at: simulation.Epoch) -> Motion:
     """Return the motion that led to an epoch."""
     if scene.inertial is None:
         return bounds.KnownTwist(at.twist, scene.dt, scene.process)
+    return felt_motion(at, scene.dt, scene.inertial)
+
+
+def felt_motion(at: simulation.Epoch, dt: float, sensor: InertialSensor) -> Motion:
+    """Return the motion that led to an epoch, known by the readings of a sensor."""
     assert at.readings is not None
     assert at.bias is not None
     # As the true motion, except for the white noise, which hardly changes the bound.
     felt = at.readings - at.bias[..., None, :]
-    steps = np.full(felt.shape[-2], scene.dt / felt.shape[-2])
-    return bounds.InertialMotion(felt, steps, scene.inertial)
+    return bounds.InertialMotion(felt, np.full(felt.shape[-2], dt / felt.shape[-2]), sensor)
 
 
 def information_size(scene: Scene) -> int:

@@ -10,8 +10,8 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import cube
-from rbl_gym.placement.gain import Gain
 from rbl_gym.placement.tokens import KINDS, Scenery
 from rbl_gym.studies.learning.random_problems import (
     Batch,

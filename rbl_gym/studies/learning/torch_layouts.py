@@ -13,8 +13,8 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement import amortised
-from rbl_gym.placement.gain import Gain
 from rbl_gym.placement.gradient import square_and_gradient
 
 _HEADS = amortised.HEADS

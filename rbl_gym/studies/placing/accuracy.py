@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.placement.building import Problem, Zone
+from rbl_gym.placement.sample import prior_of
 from rbl_gym.studies.placing.links import anchor_information, layout_information
 from rbl_gym.studies.placing.requirements import Errors, errors_of, turns
 
@@ -30,8 +30,6 @@ _MAP, _LEAST_MAP = 56, 20
 _LEVELS = 5
 # Links that are worked on at a time, so that the temporaries stay in cache.
 _BLOCK = 40_000
-# Rotation of the prior that regularises the bound, and information where the tilt is known.
-_PRIOR_ROTATION_RAD, _KNOWN = math.radians(60), 1e12
 # Drawings of a zone's bounding box after which it has no free place.
 _DRAWS, _DRAWN = 200, 4096
 
@@ -69,18 +67,6 @@ def accuracy_without_each(
 def _blocks(problem: Problem, anchors: FloatArray, places: FloatArray) -> list[FloatArray]:
     size = max(1, _BLOCK // (TURNS * len(anchors) * len(problem.tags)))
     return [places[begin : begin + size] for begin in range(0, len(places), size)]
-
-
-def prior_of(problem: Problem, zone: Zone) -> FloatArray:
-    """Return the prior information (6, 6): 60 degrees, and half of the extent of all zones.
-
-    If only the heading is estimated, the tilt is known.
-    """
-    extent = float(np.ptp(problem.corners(), axis=0).max())
-    diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
-    if zone.attitude == "heading":
-        diagonal[:2] = _KNOWN
-    return np.diag(diagonal)
 
 
 def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: int) -> FloatArray:

@@ -9,7 +9,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem
-from rbl_gym.studies.placing.accuracy import draw_places, prior_of
+from rbl_gym.placement.sample import prior_of
+from rbl_gym.studies.placing.accuracy import draw_places
 from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
 from rbl_gym.studies.placing.links import anchor_information
 from rbl_gym.studies.placing.requirements import Limits, turns

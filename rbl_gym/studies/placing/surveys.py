@@ -13,8 +13,9 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.placement.building import Problem, Zone
+from rbl_gym.placement.sample import prior_of
 from rbl_gym.studies.monte_carlo import rms
-from rbl_gym.studies.placing.accuracy import TURNS, prior_of
+from rbl_gym.studies.placing.accuracy import TURNS
 from rbl_gym.studies.placing.judging import Judged, limits_of, share_within
 from rbl_gym.studies.placing.links import link_shares
 from rbl_gym.studies.placing.requirements import Errors, errors_of, relative_errors, turns

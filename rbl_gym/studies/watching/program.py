@@ -13,9 +13,9 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement.building import Prior, Problem, Zone
-from rbl_gym.placement.gain import Gain
 from rbl_gym.recordings import Recording
 from rbl_gym.studies.replay import Settings, Track
 from rbl_gym.studies.watching.frames import Frame, filter_named
