@@ -21,7 +21,7 @@ from rbl_gym.app.studio.keeping import Keeper
 from rbl_gym.app.studio.panel import Shown
 from rbl_gym.app.studio.rays import on_plane, under_pointer
 from rbl_gym.app.studio.state import Layout, State
-from rbl_gym.app.studio.worker import Worker
+from rbl_gym.app.studio.worker import Worker, in_order
 from rbl_gym.app.studio.world import knobs_of
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.layout_files import parse_layout
@@ -97,9 +97,10 @@ class PlacePage:
 
     # # --- requests of the page ---------------------------------------------------------------
 
+    @in_order()
     def edit(self, change: Callable[[State], State]) -> None:
         """Replace the state by the result of `change` and show it, in order."""
-        self._worker.post(lambda: self._edit(change))
+        self._edit(change)
 
     def drag(self, index: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
         """Move an anchor to the mount under the pointer.
@@ -117,37 +118,28 @@ class PlacePage:
         key = None if phase != "update" else ("drag", index)
         self._worker.post(lambda: self._drag(index, phase, camera, point, asked), key)
 
+    @in_order()
     def select(self, index: int | None) -> None:
         """Select an anchor; None clears the selection."""
+        self._selected = index
+        self._show()
 
-        def task() -> None:
-            self._selected = index
-            self._show()
-
-        self._worker.post(task)
-
+    @in_order("slice")
     def cut(self, **fields: Any) -> None:
         """Show another map; arguments are fields of `Slice`."""
+        self.state = state.cut(self.state, **fields)
+        self._show_coarse()
+        if self._progress is None:
+            self._refine()
 
-        def task() -> None:
-            self.state = state.cut(self.state, **fields)
-            self._show_coarse()
-            if self._progress is None:
-                self._refine()
-
-        self._worker.post(task, "slice")
-
+    @in_order("body")
     def drag_body(self, _: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
         """Move the body on the slice to the point under the pointer. Arguments as in `drag`."""
-
-        def task() -> None:
-            axis, (low, _) = 3 - self.state.slice.up, state.plane(self.state)
-            place = on_plane(camera, point, axis, low[axis])
-            self.state = state.place_body(self.state, place)
-            self.figures = self.figures._replace(body=body_figures(self.state))
-            self._show()
-
-        self._worker.post(task, "body")
+        axis, (low, _) = 3 - self.state.slice.up, state.plane(self.state)
+        place = on_plane(camera, point, axis, low[axis])
+        self.state = state.place_body(self.state, place)
+        self.figures = self.figures._replace(body=body_figures(self.state))
+        self._show()
 
     def turn_knobs(self, **knobs: float) -> None:
         """Change `Knobs`, given by name."""
@@ -160,61 +152,46 @@ class PlacePage:
 
         self._worker.post(task, ("knobs", *knobs))
 
+    @in_order()
     def optimise(self) -> None:
         """Improve the current layout step by step. Any change ends this."""
+        self._progress, self.status = 0.0, "Optimising ..."
+        self._show()
+        self._worker.when_idle(self._improve(self.state))
 
-        def task() -> None:
-            self._progress, self.status = 0.0, "Optimising ..."
-            self._show()
-            self._worker.when_idle(self._improve(self.state))
-
-        self._worker.post(task)
-
+    @in_order()
     def stop_work(self) -> None:
         """Stop the running work and keep its result."""
+        self._end_work()
+        self.status = "Stopped."
+        self._show()
+        self._refine()
 
-        def task() -> None:
-            self._end_work()
-            self.status = "Stopped."
-            self._show()
-            self._refine()
-
-        self._worker.post(task)
-
+    @in_order()
     def redesign(self) -> None:
         """Show the designed layout for this number of anchors. Search it first if needed."""
+        now = self.state
+        found = self._others.designed.get((now.world.knobs, len(now.anchors)))
+        if found is not None and not now.fixed.any():
+            self._edit(lambda at: state.set_layout(at, Layout(found, at.fixed)))
+            return
+        self.status = "Searching for the best layout from scratch ..."
+        self._show()
+        threading.Thread(target=self._search, args=(now, True), daemon=True).start()
 
-        def task() -> None:
-            now = self.state
-            found = self._others.designed.get((now.world.knobs, len(now.anchors)))
-            if found is not None and not now.fixed.any():
-                self._edit(lambda at: state.set_layout(at, Layout(found, at.fixed)))
-                return
-            self.status = "Searching for the best layout from scratch ..."
-            self._show()
-            threading.Thread(target=self._search, args=(now, True), daemon=True).start()
-
-        self._worker.post(task)
-
+    @in_order()
     def save(self, name: str) -> None:
         """Write the scene file and the mounting list into the folder."""
+        paths = self._keeper.save(self.state, name)
+        self._say("Saved", files.names(paths), "teal")
 
-        def task() -> None:
-            paths = self._keeper.save(self.state, name)
-            self._say("Saved", files.names(paths), "teal")
-
-        self._worker.post(task)
-
+    @in_order()
     def load(self, name: str, content: bytes) -> None:
         """Replace the anchors by those of a list (CSV)."""
-
-        def task() -> None:
-            places = parse_layout(name, content).positions
-            loaded = state.open_state(self.state.world.base, places).layout
-            self._edit(lambda now: state.set_layout(now, loaded))
-            self.status = f"{len(places)} anchors of {name}."
-
-        self._worker.post(task)
+        places = parse_layout(name, content).positions
+        loaded = state.open_state(self.state.world.base, places).layout
+        self._edit(lambda now: state.set_layout(now, loaded))
+        self.status = f"{len(places)} anchors of {name}."
 
     def write_report(self, name: str) -> None:
         """Run `save` and write the report in the background."""
@@ -262,25 +239,21 @@ class PlacePage:
         self._show_coarse()
         self._refine()
 
+    @in_order()
     def _edit_and_select(self, change: Callable[[State], State]) -> None:
-        def task() -> None:
-            count = len(self.state.anchors)
-            self._edit(change)
-            if len(self.state.anchors) > count:
-                self._selected = len(self.state.anchors) - 1
-                self.status = f"Anchor {self._selected + 1} added."
-                self._show()
+        count = len(self.state.anchors)
+        self._edit(change)
+        if len(self.state.anchors) > count:
+            self._selected = len(self.state.anchors) - 1
+            self.status = f"Anchor {self._selected + 1} added."
+            self._show()
 
-        self._worker.post(task)
-
+    @in_order()
     def _of_selected(self, change: Callable[[State, int], State]) -> None:
-        def task() -> None:
-            index = self._selected
-            if index is None:
-                raise ValueError("no anchor is selected: click one first")
-            self._edit(lambda now: change(now, index))
-
-        self._worker.post(task)
+        index = self._selected
+        if index is None:
+            raise ValueError("no anchor is selected: click one first")
+        self._edit(lambda now: change(now, index))
 
     def _drag(
         self, index: int, phase: str, camera: FloatArray, point: FloatArray, asked: float

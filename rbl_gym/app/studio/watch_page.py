@@ -12,7 +12,7 @@ import numpy as np
 from rbl_gym.app.studio import scene_view
 from rbl_gym.app.studio.watch_panel import CHARTS_WIDTH, WatchPanel
 from rbl_gym.app.studio.watch_view import WatchView
-from rbl_gym.app.studio.worker import Worker
+from rbl_gym.app.studio.worker import Worker, in_order
 from rbl_gym.studies.watching.frames import Frame
 from rbl_gym.studies.watching.live import CALM, Disturbances
 from rbl_gym.studies.watching.program import Program
@@ -77,67 +77,54 @@ class WatchPage:
 
     # # --- requests of the page ---------------------------------------------------------------
 
+    @in_order()
     def play_or_pause(self) -> None:
         """Play from the current frame, or stop; at the end, start again."""
+        if not self._playing and self._over and self.at == len(self.frames) - 1:
+            self._start()
+            self._view.clear()
+        self._set_playing(not self._playing)
 
-        def task() -> None:
-            if not self._playing and self._over and self.at == len(self.frames) - 1:
-                self._start()
-                self._view.clear()
-            self._set_playing(not self._playing)
-
-        self._worker.post(task)
-
+    @in_order()
     def step(self) -> None:
         """Stop, and show the next frame."""
+        self._set_playing(False)
+        self._advance()
+        self._show(True)
 
-        def task() -> None:
-            self._set_playing(False)
-            self._advance()
-            self._show(True)
-
-        self._worker.post(task)
-
+    @in_order()
     def restart(self) -> None:
         """Play again from the first frame, with the present disturbances."""
-        self._worker.post(lambda: self._begin(self._filters, self._seed))
+        self._begin(self._filters, self._seed)
 
+    @in_order()
     def begin(self, filters: tuple[str, ...], seed: int) -> None:
         """Start at the first frame with these filters and this seed."""
-        self._worker.post(lambda: self._begin(filters, seed))
+        self._begin(filters, seed)
 
+    @in_order("seek")
     def seek(self, at: int) -> None:
         """Stop, and show a frame that was played before."""
+        self._set_playing(False)
+        self.at = min(max(at, 0), len(self.frames) - 1)
+        self._show(True)
 
-        def task() -> None:
-            self._set_playing(False)
-            self.at = min(max(at, 0), len(self.frames) - 1)
-            self._show(True)
-
-        self._worker.post(task, "seek")
-
+    @in_order()
     def set_speed(self, factor: float) -> None:
         """Set the speed relative to the clock; inf plays as fast as possible."""
+        self._speed = factor
+        if self._playing:
+            self._set_playing(True)
 
-        def task() -> None:
-            self._speed = factor
-            if self._playing:
-                self._set_playing(True)
-
-        self._worker.post(task)
-
+    @in_order("disturb")
     def disturb(self, disturbances: Disturbances) -> None:
         """Disturb all frames that are not computed yet."""
-
-        def task() -> None:
-            self._disturbances = disturbances
-            self._panel.show_disturbances(disturbances)
-            # Frames computed ahead are dropped: they lack the new disturbances.
-            if not self._over and self.at < len(self.frames) - 1:
-                self.at = len(self.frames) - 1
-                self._show(True)
-
-        self._worker.post(task, "disturb")
+        self._disturbances = disturbances
+        self._panel.show_disturbances(disturbances)
+        # Frames computed ahead are dropped: they lack the new disturbances.
+        if not self._over and self.at < len(self.frames) - 1:
+            self.at = len(self.frames) - 1
+            self._show(True)
 
     def settle(self, timeout: float = 60.0) -> bool:
         """Wait until all requests are shown; return whether this was within the time limit."""
@@ -147,22 +134,18 @@ class WatchPage:
         """Stop the worker."""
         self._worker.stop()
 
+    @in_order()
     def _set_links(self, which: int) -> None:
-        def task() -> None:
-            self._links = which
-            self._show(True)
+        self._links = which
+        self._show(True)
 
-        self._worker.post(task)
-
+    @in_order()
     def _set_follow(self, follow: bool) -> None:
-        def task() -> None:
-            self._follow = follow
-            if not follow:
-                for client in self._server.get_clients().values():
-                    scene_view.look(client, self.program.room, 0)
-            self._show(True)
-
-        self._worker.post(task)
+        self._follow = follow
+        if not follow:
+            for client in self._server.get_clients().values():
+                scene_view.look(client, self.program.room, 0)
+        self._show(True)
 
     # --- tasks of the worker ----------------------------------------------------------------
 

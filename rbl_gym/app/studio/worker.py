@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
+P = ParamSpec("P")
+Method = Callable[Concatenate[Any, P], None]
 # Interval at which waiting threads check whether to stop, seconds.
 _WAIT_S = 0.2
+
+
+def in_order(key: object = None) -> Callable[[Method[P]], Method[P]]:
+    """Make a method a task of the page's `_worker`: a call queues it and returns at once.
+
+    `key` is that of `Worker.post`.
+    """
+
+    def decorate(method: Method[P]) -> Method[P]:
+        @functools.wraps(method)
+        def post(page: Any, *args: P.args, **kwargs: P.kwargs) -> None:
+            page._worker.post(lambda: method(page, *args, **kwargs), key)
+
+        return post
+
+    return decorate
 
 
 class Worker:
@@ -53,11 +72,6 @@ class Worker:
         with self._changed:
             self._idle = steps
             self._changed.notify_all()
-
-    @property
-    def is_working(self) -> bool:
-        """Whether long work is unfinished."""
-        return self._idle is not None
 
     def settle(self, timeout: float = 60.0) -> bool:
         """Wait until all work is done; return whether this was within the time limit."""
