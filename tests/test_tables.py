@@ -19,10 +19,7 @@ def without_rich(monkeypatch):
 
 
 def example():
-    table = tables.new_table("errors [m]")
-    table.add_column("filter", no_wrap=True)
-    for heading in ("position (m)", "NEES"):
-        table.add_column(heading, justify="right")
+    table = tables.new_table("errors [m]", ["filter"], ["position (m)", "NEES"])
     table.add_row("iekf", "0.0412", "1.02", style="dim")
     table.add_section()
     table.add_row("bound", "0.04")

@@ -10,19 +10,9 @@ from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.studies.bench.leaderboard import is_recording
 
 _HEADINGS = (
-    "filter",
-    "position (m)",
-    "rotation (deg)",
-    "tags (m)",
-    "median",
-    "p95",
-    "x bound",
-    "ANEES",
-    "lost",
-    "flipped",
-    "worse than best, 95 %",
-    "us / step",
-)
+    "position (m)", "rotation (deg)", "tags (m)", "median", "p95", "x bound", "ANEES", "lost",
+    "flipped", "worse than best, 95 %", "us / step",
+)  # fmt: skip
 # Beyond this number a column would contain only digits.
 _HUGE = 1e4
 _STRESS = ("nlos", "lost-links", "noise-x2", "anchor-off", "tag-off")
@@ -57,9 +47,7 @@ def print_bench(result: dict[str, Any]) -> None:
 
 
 def _nominal(scene: str, first: dict[str, Any], by_filter: dict[str, dict[str, Any]]) -> Any:
-    table = new_table(f"{scene}, {trials(first)}, seed {first['seed']}")
-    for heading in _HEADINGS:
-        table.add_column(heading, justify="left" if heading == "filter" else "right")
+    table = new_table(f"{scene}, {trials(first)}, seed {first['seed']}", ["filter"], _HEADINGS)
     order = sorted(by_filter.items(), key=lambda item: _tags(item[1], "nominal"))
     ran = {name: rows["nominal"] for name, rows in order if "tags_m" in rows["nominal"]}
     bounds = [row for row in ran.values() if "bound" in row["tags_m"]][-1:]
@@ -104,10 +92,7 @@ def _worse(ran: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str]) -> Any:
-    table = new_table(f"{scene}, stress")
-    table.add_column("filter")
-    for heading in stress:
-        table.add_column(heading, justify="right")
+    table = new_table(f"{scene}, stress", ["filter"], stress)
     order = "nominal" if any("nominal" in rows for rows in by_filter.values()) else stress[0]
     names = sorted(by_filter, key=lambda name: _tags(by_filter[name], order))
     columns = [_stress([by_filter[name][condition] for name in names]) for condition in stress]
@@ -204,9 +189,8 @@ def print_rerun(result: dict[str, Any]) -> None:
         console.print(f"  {name}: {before} then, {after} now")
     if not result["changed"]:
         return
-    table = new_table("what differs")
-    for heading in ("scene", "condition", "filter", "fields", "most: field", "then", "now", "by"):
-        table.add_column(heading)
+    headings = "scene", "condition", "filter", "fields", "most: field", "then", "now", "by"
+    table = new_table("what differs", headings)
     for row in result["changed"]:
         change = row["relative_change"]
         table.add_row(

@@ -59,11 +59,10 @@ def _print(result: dict[str, Any]) -> None:
     for key, label, n in (("position_m", "position (m)", 3), ("rotation_deg", "rotation (deg)", 3)):
         table = new_table(
             f"{result['scene']}: bound of {label}, {result['epochs']} epochs, {result['trials']} "
-            "trials; in brackets: the second half of the epochs"
+            "trials; in brackets: the second half of the epochs",
+            ["not known"],
+            motions,
         )
-        table.add_column("not known")
-        for motion in motions:
-            table.add_column(motion, justify="right")
         for unknown in unknowns:
             cells = [
                 f"{digits(rows[m, unknown][key], n)} ({digits(rows[m, unknown]['late_' + key], n)})"

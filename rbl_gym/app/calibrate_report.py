@@ -7,6 +7,8 @@ from typing import Any
 
 from rbl_gym.app.tables import new_console, new_table
 
+_PLACE = ("x", "y", "z", "+-x", "+-y", "+-z")
+
 
 def print_calibrated(figures: dict[str, Any]) -> None:
     """Print links or anchors, and undetermined quantities."""
@@ -15,10 +17,8 @@ def print_calibrated(figures: dict[str, Any]) -> None:
 
 def _print_anchors(figures: dict[str, Any]) -> None:
     console = new_console()
-    table = new_table(f"{figures['ranges']} ranges of {figures['epochs']} epochs [m]")
-    table.add_column("anchor")
-    for heading in ("x", "y", "z", "+-x", "+-y", "+-z"):
-        table.add_column(heading, justify="right")
+    title = f"{figures['ranges']} ranges of {figures['epochs']} epochs [m]"
+    table = new_table(title, ["anchor"], _PLACE)
     for row in figures["anchors"]:
         std = ["known"] * 3 if row["known"] else [f"{x:.3f}" for x in row["std_m"]]
         table.add_row(row["anchor"], *(f"{x:.3f}" for x in row["place_m"]), *std)
@@ -38,11 +38,8 @@ def _print_links(figures: dict[str, Any]) -> None:
     """Print links, tags, clock, and undetermined quantities."""
     console = new_console()
     title = f"{figures['ranges']} ranges, biases by {figures['biases']}"
-    table = new_table(title)
-    for heading in ("anchor", "tag"):
-        table.add_column(heading)
-    for heading in ("ranges", "bias [m]", "+-", "slope", "+-", "noise [m]"):
-        table.add_column(heading, justify="right")
+    headings = "ranges", "bias [m]", "+-", "slope", "+-", "noise [m]"
+    table = new_table(title, ["anchor", "tag"], headings)
     for row in figures["links"]:
         table.add_row(
             row["anchor"],
@@ -56,18 +53,13 @@ def _print_links(figures: dict[str, Any]) -> None:
         )
     console.print(table)
     if "nodes" in figures:
-        table = new_table("antenna delays of nodes, those of the tags relative to their mean")
-        table.add_column("node")
-        for heading in ("delay [m]", "+-"):
-            table.add_column(heading, justify="right")
+        title = "antenna delays of nodes, those of the tags relative to their mean"
+        table = new_table(title, ["node"], ["delay [m]", "+-"])
         for row in figures["nodes"]:
             kind = "anchor" if "anchor" in row else "tag"
             table.add_row(f"{kind} {row[kind]}", f"{row['delay_m']:.3f}", f"{row['std_m']:.3f}")
         console.print(table)
-    table = new_table("tags in the truth's body frame [m]")
-    table.add_column("tag")
-    for heading in ("x", "y", "z", "+-x", "+-y", "+-z"):
-        table.add_column(heading, justify="right")
+    table = new_table("tags in the truth's body frame [m]", ["tag"], _PLACE)
     for row in figures["tags"]:
         numbers = *row["place_m"], *row["std_m"]
         table.add_row(row["tag"], *("held" if x is None else f"{x:.3f}" for x in numbers))

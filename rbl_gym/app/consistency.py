@@ -29,10 +29,7 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
         f"NIS per degree of freedom {found['nis_per_dof']:.2f} (1: consistent), log-likelihood "
         f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % rejected"
     )
-    table = new_table("residuals after the update")
-    table.add_column("")
-    for heading in _HEADINGS:
-        table.add_column(heading, justify="right")
+    table = new_table("residuals after the update", [""], _HEADINGS)
     for kind in ("anchor", "tag"):
         rows = found["residuals"][f"{kind}s"]
         if len(rows) > _ROWS:

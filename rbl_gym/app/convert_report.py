@@ -10,12 +10,7 @@ from rbl_gym.app.tables import new_console, new_table
 
 def print_topics(topics: Sequence[dict[str, Any]]) -> None:
     """Print the topics of a log."""
-    table = new_table()
-    for heading in ("topic", "type"):
-        table.add_column(heading)
-    for heading in ("messages", "Hz"):
-        table.add_column(heading, justify="right")
-    table.add_column("read as")
+    table = new_table(None, ["topic", "type"], ["messages", "Hz"], ["read as"])
     for row in topics:
         figures = str(row["messages"]), _hertz(row["rate_hz"])
         table.add_row(row["topic"], row["type"], *figures, ", ".join(row["read_as"]))
@@ -24,9 +19,7 @@ def print_topics(topics: Sequence[dict[str, Any]]) -> None:
 
 def print_fields(fields: Sequence[tuple[str, str]]) -> None:
     """Print field paths of a message and their first values."""
-    table = new_table()
-    for heading in ("field", "in the first message"):
-        table.add_column(heading)
+    table = new_table(None, ["field", "in the first message"])
     for row in fields:
         table.add_row(*row)
     new_console().print(table)
@@ -35,11 +28,8 @@ def print_fields(fields: Sequence[tuple[str, str]]) -> None:
 def print_convert(result: dict[str, Any]) -> None:
     """Print what was read, written and dropped, and the next command."""
     console = new_console()
-    table = new_table()
-    for heading in ("", "topic", "type"):
-        table.add_column(heading)
-    for heading in ("messages", "rows", "from (s)", "for (s)", "Hz"):
-        table.add_column(heading, justify="right")
+    headings = "messages", "rows", "from (s)", "for (s)", "Hz"
+    table = new_table(None, ["", "topic", "type"], headings)
     for kind, said in result["kinds"].items():
         first, *more = said["topics"]
         table.add_row(

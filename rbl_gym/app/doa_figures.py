@@ -66,22 +66,12 @@ def print_doa2019(result: dict[str, Any]) -> None:
     out = new_console()
     _print_table_1(out, result)
     for label, data in result["settings"].items():
-        table = new_table(f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
-        table.add_column("noise (deg)")
-        table.add_column("method")
-        for heading in (
-            "R RMSE",
-            "R / bound",
-            "t RMSE (m)",
-            "t / bound",
-            "near truth",
-            "t < 0.5 m",
-            "converged",
-            "iterations",
-            "us / trial",
-            "x NIA",
-        ):
-            table.add_column(heading, justify="right")
+        table = new_table(
+            f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials",
+            ["noise (deg)", "method"],
+            ["R RMSE", "R / bound", "t RMSE (m)", "t / bound", "near truth", "t < 0.5 m",
+             "converged", "iterations", "us / trial", "x NIA"],
+        )  # fmt: skip
         for k, sigma in enumerate(data["sigma_deg"]):
             for name, method in data["methods"].items():
                 row = {key: values[k] for key, values in method.items()}
@@ -120,19 +110,11 @@ def print_doa2019(result: dict[str, Any]) -> None:
 
 def _print_table_1(out: Any, result: dict[str, Any]) -> None:
     data = result["settings"][_PAPERS]
-    table = new_table(f"Table 1 of the paper beside ours, {_PAPERS}")
-    for heading in (
-        "noise (deg)",
-        "method",
-        "paper: success",
-        "ours: near truth",
-        "ours: t < 0.5 m",
-        "paper: time (s)",
-        "ours: time (s)",
-        "paper: x NIA",
-        "ours: x NIA",
-    ):
-        table.add_column(heading, justify="right")
+    headings = (
+        "noise (deg)", "method", "paper: success", "ours: near truth", "ours: t < 0.5 m",
+        "paper: time (s)", "ours: time (s)", "paper: x NIA", "ours: x NIA",
+    )  # fmt: skip
+    table = new_table(f"Table 1 of the paper beside ours, {_PAPERS}", (), headings)
     for k, sigma in enumerate(data["sigma_deg"]):
         for name, paper in result["table_1"].items():
             method = data["methods"][name]

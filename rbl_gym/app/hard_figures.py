@@ -66,21 +66,11 @@ def print_hard(result: dict[str, Any]) -> None:
     """Print one table of links for each scene, and one of starts."""
     console = new_console()
     for name, conditions in result["links"].items():
-        table = new_table(f"{name}, {result['trials']} trials")
-        table.add_column("links", no_wrap=True)
-        table.add_column("filter", no_wrap=True)
-        for heading in (
-            "rot / clean",
-            "pos / clean",
-            "rot / good",
-            "pos / good",
-            "NEES (6)",
-            "lost last",
-            "ever",
-            "largest (m)",
-            "us / step",
-        ):
-            table.add_column(heading, justify="right")
+        headings = (
+            "rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)", "lost last",
+            "ever", "largest (m)", "us / step",
+        )  # fmt: skip
+        table = new_table(f"{name}, {result['trials']} trials", ["links", "filter"], headings)
         for condition, row in conditions.items():
             for label, figures in row["filters"].items():
                 ratios = [
@@ -99,11 +89,8 @@ def print_hard(result: dict[str, Any]) -> None:
             table.add_section()
         console.print(table)
     after = result["starts"]["after"]
-    table = new_table(f"recovered trials (%) after so many epochs, {result['trials']} trials")
-    for heading in ("scene", "start", "filter"):
-        table.add_column(heading)
-    for heading in (*map(str, after), "us / step"):
-        table.add_column(heading, justify="right")
+    title = f"recovered trials (%) after so many epochs, {result['trials']} trials"
+    table = new_table(title, ["scene", "start", "filter"], [*map(str, after), "us / step"])
     for name, starts in result["starts"]["scenes"].items():
         for start, rows in starts.items():
             for label, row in rows.items():

@@ -186,20 +186,11 @@ def print_network2009(result: dict[str, Any]) -> None:
         slopes = ", ".join(f"{rule} n^{slope:.2f}" for rule, slope in data["slope"].items())
         out.print(f"kappa, {name}: {slopes}")
     out.print("Section IV-E: the trace's kappa is O(1 / n^3) at worst, O(1 / n) in triangulations.")
-    table = new_table(f"convergence, {network2009.EXAMPLE_LOOPS} loops")
-    for heading in (
-        "cycles",
-        "kappa",
-        "steps",
-        "lambda",
-        "measured",
-        "true",
-        "true^2",
-        "(1 - kappa)^2",
-        "kappa <= Theorem 19's",
-        "factor holds",
-    ):
-        table.add_column(heading, justify="right")
+    headings = (
+        "cycles", "kappa", "steps", "lambda", "measured", "true", "true^2", "(1 - kappa)^2",
+        "kappa <= Theorem 19's", "factor holds",
+    )  # fmt: skip
+    table = new_table(f"convergence, {network2009.EXAMPLE_LOOPS} loops", (), headings)
     for basis, rules in result["convergence"].items():
         for rule, row in rules.items():
             table.add_row(
@@ -221,15 +212,8 @@ def print_network2009(result: dict[str, Any]) -> None:
             f"{row['rounds']:.0f} rounds, {row['largest_error_rad']:.1e} rad from the "
             "projection"
         )
-    table = new_table(f"three nodes in space, {result['trials']} trials")
-    for heading in (
-        "triangle",
-        "sigma (rad)",
-        "RMS turn (rad)",
-        "/ bound",
-        "misfit / (6^.5 sigma)",
-    ):
-        table.add_column(heading, justify="right")
+    headings = "triangle", "sigma (rad)", "RMS turn (rad)", "/ bound", "misfit / (6^.5 sigma)"
+    table = new_table(f"three nodes in space, {result['trials']} trials", (), headings)
     for row in result["space"]:
         table.add_row(
             row["shape"],
@@ -243,21 +227,12 @@ def print_network2009(result: dict[str, Any]) -> None:
 
 def _print_accuracy(out: Any, result: dict[str, Any]) -> None:
     places = result["networks"]["positions"]
-    table = new_table(
-        f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}, "
-        f"{result['trials']} trials"
-    )
-    for heading in (
-        "footprint",
-        "edges",
-        "loops",
-        "MSE of y",
-        "MSE of psi",
-        "bound (rad^2)",
-        "psi / bound",
+    title = f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}"
+    headings = (
+        "footprint", "edges", "loops", "MSE of y", "MSE of psi", "bound (rad^2)", "psi / bound",
         "ml / bound",
-    ):
-        table.add_column(heading, justify="right")
+    )  # fmt: skip
+    table = new_table(f"{title}, {result['trials']} trials", (), headings)
     for row in result["accuracy"]:
         ratios = [
             f"{row['ratio'][name]:.3f} +- {row['ratio_std_error'][name]:.3f}"

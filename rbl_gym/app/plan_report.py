@@ -34,9 +34,8 @@ def print_plan(layers: list[dict[str, Any]], said: list[str]) -> None:
     """Print the layers, including unmapped ones, and remarks."""
     console = new_console()
     if layers:
-        table = new_table("layers of the drawing")
-        for heading in ("layer", "read as", "entities", "not read"):
-            table.add_column(heading)
+        headings = "layer", "read as", "entities", "not read"
+        table = new_table("layers of the drawing", headings)
         for row in layers:
             table.add_row(
                 row["layer"],

@@ -31,10 +31,8 @@ _NO_NUMBERS = {
 def print_camsap2013(result: dict[str, Any]) -> None:
     """Print the filters in a table, and the claims of the paper with our figures."""
     console = new_console()
-    table = new_table(f"{result['experiment']}, {result['trials']} trials")
-    table.add_column("filter")
-    for heading, _, _ in CAMSAP_COLUMNS:
-        table.add_column(heading, justify="right")
+    title = f"{result['experiment']}, {result['trials']} trials"
+    table = new_table(title, ["filter"], [heading for heading, _, _ in CAMSAP_COLUMNS])
     for label, figures in result["filters"].items():
         table.add_row(label, *(form.format(figures[key]) for _, key, form in CAMSAP_COLUMNS))
     console.print(table)
@@ -69,13 +67,11 @@ def print_static(result: dict[str, Any]) -> None:
         low, high = data["reference_range_db"][0], data["reference_range_db"][-1]
         table = new_table(
             f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
-            f"{result['trials']} trials"
-        )
-        table.add_column("method")
-        for heading in ("angle / bound", "rotation / bound", "translation / bound"):
-            table.add_column(heading, justify="right")
-        table.add_column(f"angle at {high} dB (deg)", justify="right")
-        table.add_column(f"NEES at {high} dB (6)", justify="right")
+            f"{result['trials']} trials",
+            ["method"],
+            ["angle / bound", "rotation / bound", "translation / bound",
+             f"angle at {high} dB (deg)", f"NEES at {high} dB (6)"],
+        )  # fmt: skip
         for name, method in data["methods"].items():
             ratios = [f"{ratio:.3f}" for ratio in method["ratio"].values()]
             angle = f"{method['mean_angular_error_deg'][-1]:.5f}"
@@ -126,9 +122,7 @@ def print_replay(result: dict[str, Any]) -> None:
 
 
 def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -> None:
-    table = new_table()
-    for heading in (title, "RMSE", "median", "p95"):
-        table.add_column(heading, justify="left" if heading == title else "right")
+    table = new_table(None, [title], ["RMSE", "median", "p95"])
     for name, unit, places in (
         ("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2), ("centre", "m", 4),
         ("axis", "deg", 2),
@@ -163,10 +157,8 @@ def print_runs(result: dict[str, Any]) -> None:
         )
         if name in result["together"]
     ]
-    table = new_table()
-    table.add_column("run")
-    for heading in ("epochs", "with truth", *(name.replace("_", " ") for name, _ in columns)):
-        table.add_column(heading, justify="right")
+    headings = ["epochs", "with truth", *(name.replace("_", " ") for name, _ in columns)]
+    table = new_table(None, ["run"], headings)
     for run, one in every.items():
         cells = [f"{one[name]:.{places}f}" if name in one else "" for name, places in columns]
         table.add_row(run, str(one["epochs"]), str(one.get("epochs_with_truth", 0)), *cells)
@@ -252,10 +244,8 @@ def print_training(result: dict[str, Any]) -> None:
 def print_evaluation(result: dict[str, Any]) -> None:
     """Print policies and references, the best first."""
     console = new_console()
-    table = new_table(f"{result['task']}, {result['worlds']} held-out worlds")
-    table.add_column("policy")
-    for heading in ("loss", "score b (m)", "normalised", "95 %"):
-        table.add_column(heading, justify="right")
+    title = f"{result['task']}, {result['worlds']} held-out worlds"
+    table = new_table(title, ["policy"], ["loss", "score b (m)", "normalised", "95 %"])
     for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
         interval = f"{row['normalised_low']:.3f} to {row['normalised_high']:.3f}"
         table.add_row(
@@ -277,11 +267,10 @@ def print_transfer(result: dict[str, Any]) -> None:
     for name, rows in result["filters"].items():
         table = new_table(
             f"{result['task']}, {name}, {result['worlds']} worlds, "
-            f"{result['repeats']} bodies in each"
+            f"{result['repeats']} bodies in each",
+            ["layouts"],
+            ["score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"],
         )
-        table.add_column("layouts")
-        for heading in ("score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"):
-            table.add_column(heading, justify="right")
         for label, row in rows.items():
             alike = row["correlation"]
             table.add_row(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -35,13 +36,32 @@ def rich_console(**arguments: Any) -> Any:
     return RichConsole(**arguments)
 
 
-def new_table(title: str | None = None) -> Any:
-    """Return a table for `new_console`: rich's, or plain text with the same methods."""
-    if not has_rich():
-        return _PlainTable(title)
-    from rich.table import Table
+def new_table(
+    title: str | None, texts: Iterable[str], figures: Iterable[str] = (), notes: Iterable[str] = ()
+) -> Any:
+    """Return a table for `new_console`: rich's, or plain text with the same methods.
 
-    return Table(title=title, title_justify="left")
+    Parameters
+    ----------
+    title
+        Title above the table; None: no title.
+    texts, figures, notes
+        Headings of the columns: texts on the left, then figures, aligned right, then further texts.
+        The first column is not wrapped.
+    """
+    if has_rich():
+        from rich.table import Table
+
+        table: Any = Table(title=title, title_justify="left")
+    else:
+        table = _PlainTable(title)
+    for index, heading in enumerate(texts):
+        table.add_column(heading, no_wrap=not index)
+    for heading in figures:
+        table.add_column(heading, justify="right")
+    for heading in notes:
+        table.add_column(heading)
+    return table
 
 
 class _PlainConsole:
