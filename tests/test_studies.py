@@ -138,8 +138,8 @@ def test_place(capsys, monkeypatch):
     assert placed.result == printed(capsys, "place", *arguments)
     assert isinstance(placed, answer.Placed)
     assert isinstance(placed.design, design.Design)
-    maps = accuracy.level_maps(problem, placed.design.anchors)
-    assert all(isinstance(level, accuracy.Map) for level in maps)
+    plan = accuracy.accuracy_map(problem, placed.design.anchors)
+    assert isinstance(plan, accuracy.Map)
     again = check.check_layout(problem, placed.design.anchors, 20, 0)
     assert again == placed.result["check"]
     drawn = check.draw_bodies(problem, placed.design.anchors, 5, np.random.default_rng(0))

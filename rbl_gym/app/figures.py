@@ -258,9 +258,9 @@ def _common_legend(figure: Figure, axes: Any) -> None:
     )
 
 
-def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
-    """Return the outline (points, 2) of the 95 % region of a planar zero-mean Gaussian."""
-    angle = np.linspace(0, 2 * np.pi, points)
+def ellipse(covariance: FloatArray) -> FloatArray:
+    """Return the outline (60, 2) of the 95 % region of a planar zero-mean Gaussian."""
+    angle = np.linspace(0, 2 * np.pi, 60)
     values, vectors = np.linalg.eigh(covariance)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return (vectors @ (np.sqrt(5.991 * values)[:, None] * circle)).T

@@ -21,9 +21,7 @@ COLOURS = "viridis_r"
 _WHITE = {"boxstyle": "round,pad=0.18", "fc": "white", "ec": "0.75", "lw": 0.5, "alpha": 0.92}
 
 
-def draw_building(
-    axes: Any, problem: Problem, anchors: FloatArray, mounts: bool = True, names: bool = True
-) -> None:
+def draw_building(axes: Any, problem: Problem, anchors: FloatArray, names: bool = True) -> None:
     """Draw backdrop, obstacles, zones, and mounts; axes in metres."""
     edges = shapes.limits(problem, anchors)
     axes.set_xlim(*edges[:, 0])
@@ -45,7 +43,7 @@ def draw_building(
         ),
         autolim=False,
     )
-    if mounts and not shapes.is_far(problem, anchors):
+    if not shapes.is_far(problem, anchors):
         lines, areas = shapes.mount_shapes(problem)
         axes.add_collection(
             PolyCollection(areas, facecolors="#ede3f1", edgecolors="#ede3f1", lw=0.4, zorder=-2),

@@ -151,7 +151,7 @@ def is_far(problem: Problem, anchors: FloatArray) -> bool:
     return bool(reach > _FAR * 0.5 * (high - low)[:2].max())
 
 
-def limits(problem: Problem, anchors: FloatArray, margin: float = 0.03) -> FloatArray:
+def limits(problem: Problem, anchors: FloatArray) -> FloatArray:
     """Return lower and upper corner (2, 2) of the plan."""
     points = [corner[:2] for corner in problem.corners()]
     far = is_far(problem, anchors)
@@ -162,7 +162,7 @@ def limits(problem: Problem, anchors: FloatArray, margin: float = 0.03) -> Float
         points += [corner for shape in (*lines, *areas) for corner in shape]
     array = np.array(points)
     extent = np.ptp(array, axis=0)
-    around = (0.2 if far else margin) * np.maximum(extent, 0.2 * extent.max())
+    around = (0.2 if far else 0.03) * np.maximum(extent, 0.2 * extent.max())
     return np.array([array.min(axis=0) - around, array.max(axis=0) + around])
 
 

@@ -40,6 +40,16 @@ class Recording(NamedTuple):
         shape = (len(self.times), *self.anchors.shape[-2:])
         return np.broadcast_to(self.anchors, shape)
 
+    def part(self, epochs: slice) -> Recording:
+        """Return some epochs; truth and readings of sensors, with times of their own, are kept."""
+        return self._replace(
+            times=self.times[epochs],
+            ranges=self.ranges[epochs],
+            links=self.links[epochs],
+            range_std=None if self.range_std is None else self.range_std[epochs],
+            anchors=self.anchors[epochs] if self.anchors.ndim == 3 else self.anchors,
+        )
+
     @property
     def last_anchors(self) -> FloatArray:
         """Return the anchors (M, 3) at fixed positions, or at their last positions."""

@@ -170,15 +170,13 @@ class _Maker:
 
     def _obstacles(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
         heights = {"low_m": 0.0, "high_m": self.height}
-        return self._rings(lines, marks, layer, use, KEYS["obstacles"], heights)
+        return self._rings(lines, marks, layer, use, heights)
 
-    def _forbidden(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
-        heights = {"low_m": 0.0, "high_m": self.height}
-        return self._rings(lines, marks, layer, use, KEYS["forbidden"], heights)
+    _forbidden = _obstacles
 
     def _zones(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
         heights: dict[str, Any] = dict(zip(("low_m", "high_m"), ZONE_M, strict=True))
-        rows, left = self._rings(lines, marks, layer, use, KEYS["zones"], heights)
+        rows, left = self._rings(lines, marks, layer, use, heights)
         texts = [label for label in self.drawing.labels if label.layer == layer]
         for count, row in enumerate(rows, start=1):
             ring = np.array(row["polygon"])
@@ -236,7 +234,6 @@ class _Maker:
         marks: list[Shape],
         layer: str,
         use: Use,
-        keys: Iterable[str],
         usual: dict[str, Any],
     ) -> Any:
         rows, failed = [], 0
@@ -245,7 +242,8 @@ class _Maker:
                 continue
             ring = outline_of(line)
             failed += line.holes != () and len(ring) == len(line.points)
-            rows.append({"polygon": points_of(ring), **self._values(line, use, keys, usual)})
+            values = self._values(line, use, KEYS[use.kind], usual)
+            rows.append({"polygon": points_of(ring), **values})
         return _commented(rows, layer), [
             (len(lines) - len(rows), "lines that enclose no area were left out"),
             (failed, "holes could not be cut out"),

@@ -17,7 +17,6 @@ __all__ = [
     "accuracy",
     "accuracy_map",
     "accuracy_without_each",
-    "level_maps",
 ]
 
 # Turns of the body over which the accuracy at a place is averaged.
@@ -26,8 +25,6 @@ TURNS = 9
 _GRID = (9, 9, 3)
 # Places along the longer side of a map, and at least along the other.
 _MAP, _LEAST_MAP = 56, 20
-# Heights at which a map is drawn in 3-D.
-_LEVELS = 5
 # Links that are worked on at a time, so that the temporaries stay in cache.
 _BLOCK = 40_000
 # Drawings of a zone's bounding box after which it has no free place.
@@ -110,11 +107,10 @@ def free_grid(problem: Problem, zone: Zone) -> FloatArray:
 
 
 class Map(NamedTuple):
-    """Accuracy on a plane: edges of its axes, values (rows, columns), NaN: off the zone or blocked.
+    """Accuracy at one height: edges of x and y, values (rows, columns), NaN: off the zone, blocked.
 
-    `across` and `up` are the axes (0, 1, 2) of columns and rows, `at` the third coordinate.
-    Position and rotation are of all three axes together; `horizontal`, `height` (m) and
-    `heading` (degrees) are what zones ask for.
+    `at` is the height. Position and rotation are of all three axes together; `horizontal`, `height`
+    (m) and `heading` (degrees) are what zones ask for.
     """
 
     columns: FloatArray
@@ -124,44 +120,37 @@ class Map(NamedTuple):
     horizontal: FloatArray
     height: FloatArray
     heading: FloatArray
-    across: int
-    up: int
     at: float
 
 
 def accuracy_map(
     problem: Problem,
     anchors: FloatArray,
-    up: int = 1,
     share: float = 0.5,
     zone: Zone | None = None,
 ) -> Map:
-    """Return the accuracy on a plane of a zone.
+    """Return the accuracy over x and y at one height of a zone.
 
     Parameters
     ----------
     problem, anchors
         The problem, and the anchors (M, 3).
-    up
-        1: over x and y; 2: over x and z.
     share
-        Position of the plane on the third axis: 0 is the lower side of the zone, 1 the upper one.
+        The height: 0 is the lower side of the zone, 1 the upper one.
     zone
         None: the first.
     """
     zone = problem.zones[0] if zone is None else zone
     low, high = zone.bounds()
-    third = 3 - up
-    at = float(low[third] + share * (high - low)[third])
-    extent = max(float((high - low)[[0, up]].max()), 1e-9)
+    at = float(low[2] + share * (high - low)[2])
+    extent = max(float((high - low)[:2].max()), 1e-9)
     centres = []
-    for axis in (0, up):
+    for axis in (0, 1):
         least = _LEAST_MAP if high[axis] > low[axis] else 1
         count = max(least, round(_MAP * (high - low)[axis] / extent))
         share_of = (np.arange(count) + 0.5) / count
         centres.append(low[axis] + share_of * (high - low)[axis])
-    places = np.empty((len(centres[1]), len(centres[0]), 3))
-    places[..., 0], places[..., up], places[..., third] = centres[0], centres[1][:, None], at
+    places = np.stack(np.meshgrid(*centres, at), axis=-1)[:, :, 0]
     free = is_free(problem, zone, places)
     found = np.full((len(Errors._fields), *free.shape), np.nan)
     if free.any():
@@ -175,14 +164,5 @@ def accuracy_map(
         horizontal=errors.horizontal,
         height=errors.height,
         heading=np.rad2deg(errors.heading),
-        across=0,
-        up=up,
         at=at,
     )
-
-
-def level_maps(problem: Problem, anchors: FloatArray, zone: Zone | None = None) -> list[Map]:
-    """Return maps over x and y at heights from the bottom to the top of a zone."""
-    zone = problem.zones[0] if zone is None else zone
-    shares = np.linspace(0, 1, _LEVELS) if zone.high_m > zone.low_m else [0.5]
-    return [accuracy_map(problem, anchors, share=float(share), zone=zone) for share in shares]

@@ -28,6 +28,8 @@ __all__ = ["Stock", "ZonePoses", "all_choices", "cheaper", "grown", "swapped", "
 
 # An exchange must better the value by this share, or it is not worth the time.
 _GAIN = 1e-3
+# Exchanges end after so many passes over all anchors.
+_SWEEPS = 20
 # Weight of the mean beside the place that fills the share: which of two layouts is better where
 # that place does not tell, and a slope where no layout is near the requirement.
 _OF_MEAN = 1e-2
@@ -134,7 +136,7 @@ def grown(
 
 
 def swapped(
-    stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0, sweeps: int = 20
+    stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
 ) -> tuple[list[int], float]:
     """Exchange single anchors for candidates while it helps; return the layout and its value.
 
@@ -146,11 +148,9 @@ def swapped(
         So many of the first stay.
     survive
         As in `value`.
-    sweeps
-        At most so many times over all anchors.
     """
     found, best, coarse = list(chosen), value(stock, chosen, survive), _coarse(stock)
-    for _ in range(sweeps):
+    for _ in range(_SWEEPS):
         before = best
         for k in range(keep, len(found)):
             others = found[:k] + found[k + 1 :]

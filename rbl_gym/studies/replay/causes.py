@@ -76,7 +76,7 @@ def likely_causes(
     if poses is not None and settings.filter == "iekf-imu":
         yaw = math.degrees(float(rotations.yaw(poses[0][part.start])))
         settings = settings.changed(start=(*poses[1][part.start].tolist(), yaw))
-    trial = local_trial(cut(recording, part), settings)
+    trial = local_trial(recording.part(part), settings)
     excess, left = 0.0, 1.0
     causes: list[Cause] = []
     while len(causes) < 2 and left > _WORTH:
@@ -132,21 +132,8 @@ def _strained_part(recording: Recording, found: Innovations) -> slice:
     return slice(first, first + size)
 
 
-def cut(recording: Recording, epochs: slice) -> Recording:
-    """Return some epochs of a recording, without the truth."""
-    std, anchors = recording.range_std, recording.anchors
-    return recording._replace(
-        times=recording.times[epochs],
-        ranges=recording.ranges[epochs],
-        links=recording.links[epochs],
-        range_std=None if std is None else std[epochs],
-        anchors=anchors[epochs] if anchors.ndim == 3 else anchors,
-        truth=None,
-    )
-
-
 def local_trial(recording: Recording, settings: Settings) -> Trial:
-    """Return a recording relative to its anchors, if it has map coordinates."""
+    """Return a recording without its truth, relative to its anchors if it has map coordinates."""
     origin = origin_of(recording)
     known = settings.knowledge
     changed: dict[str, Any] = {}
@@ -158,4 +145,5 @@ def local_trial(recording: Recording, settings: Settings) -> Trial:
     if known.height_m is not None:
         changed["height_m"] = known.height_m - float(origin[2])
     settings = settings.changed(**changed)
-    return Trial(recording._replace(anchors=recording.anchors - origin), settings)
+    local = recording._replace(anchors=recording.anchors - origin, truth=None)
+    return Trial(local, settings)

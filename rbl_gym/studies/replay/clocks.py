@@ -11,7 +11,7 @@ import numpy as np
 
 from rbl_gym.estimators.calibration.inertial_clock import TaggedRanges, inertial_clock
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.replay.causes import cut, local_trial
+from rbl_gym.studies.replay.causes import local_trial
 from rbl_gym.studies.replay.evidence import evidence, std_of
 from rbl_gym.studies.replay.place import start_of
 from rbl_gym.studies.replay.settings import Settings
@@ -76,7 +76,7 @@ def sensor_clock(
         for _ in range(CLOCK_TRIALS):
             advance()
         return clock
-    trial = local_trial(cut(recording, slice(_MOST)), settings)
+    trial = local_trial(recording.part(slice(_MOST)), settings)
     given = float(settings.flat()[name])
     seen: dict[float, float] = {}
     best = given

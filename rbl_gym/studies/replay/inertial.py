@@ -18,15 +18,13 @@ __all__ = ["covered"]
 _LOOK_S, _TILT_RAD = 0.25, np.deg2rad(3.0)
 
 
-def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> Recording:
-    """Return the epochs with readings of the inertial sensor, including a margin.
+def covered(recording: Recording, settings: Settings) -> Recording:
+    """Return the epochs with readings of the inertial sensor.
 
     Parameters
     ----------
     recording, settings
         A log, and by how much the sensor's clock is ahead.
-    margin_s
-        Readings that are there beyond the epochs, seconds on both sides.
 
     Raises
     ------
@@ -36,7 +34,7 @@ def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> 
     log = clocked(recording, settings)
     if log is None:
         return recording
-    low, high = log.times[0] + _LOOK_S + margin_s, log.times[-1] - margin_s
+    low, high = log.times[0] + _LOOK_S, log.times[-1]
     inside = np.flatnonzero((recording.times >= low) & (recording.times <= high))
     if not len(inside):
         raise ValueError(
@@ -44,15 +42,7 @@ def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> 
             f"the ranges, but the ranges are from {recording.times[0]:.6g} to "
             f"{recording.times[-1]:.6g} s: see --time-offset imu=S"
         )
-    part = slice(inside[0], inside[-1] + 1)
-    std, anchors = recording.range_std, recording.anchors
-    return recording._replace(
-        times=recording.times[part],
-        ranges=recording.ranges[part],
-        links=recording.links[part],
-        range_std=None if std is None else std[part],
-        anchors=anchors[part] if anchors.ndim == 3 else anchors,
-    )
+    return recording.part(slice(inside[0], inside[-1] + 1))
 
 
 def clocked(recording: Recording, settings: Settings) -> InertialLog | None:

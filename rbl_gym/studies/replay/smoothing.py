@@ -157,13 +157,8 @@ def _starts(
         # Neither a body at rest nor reversed time is compatible with inertial readings.
         return
     times = recording.times
-    moving = recording.anchors.ndim == 3
-    backwards = recording._replace(
+    backwards = recording.part(slice(None, None, -1))._replace(
         times=times[-1] + times[0] - times[::-1],
-        ranges=recording.ranges[::-1],
-        links=recording.links[::-1],
-        range_std=None if recording.range_std is None else recording.range_std[::-1],
-        anchors=recording.anchors[::-1] if moving else recording.anchors,
         truth=None,
         odometry=_backwards(recording, settings),
     )

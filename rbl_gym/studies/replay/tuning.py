@@ -9,7 +9,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.replay.causes import cut, local_trial
+from rbl_gym.studies.replay.causes import local_trial
 from rbl_gym.studies.replay.evidence import Trial, evidence
 from rbl_gym.studies.replay.place import own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
@@ -106,7 +106,7 @@ def tune(
         raise ValueError(
             f"the first {seconds:g} s must have at least 10 epochs for tuning, got {count}"
         )
-    given = local_trial(cut(recording, slice(count)), settings)
+    given = local_trial(recording.part(slice(count)), settings)
     ranges = given.recording.links.sum()
     before = float(evidence([given]).log_likelihood.sum() / ranges)
     names = dict.fromkeys(filters or (settings.filter_text,))
