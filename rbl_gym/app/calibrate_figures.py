@@ -35,20 +35,17 @@ def _anchors_figure(found: SurveyedAnchors) -> Figure:
         left.plot(*(ring + state.anchors[m, :2]).T, color="#1b7f5c", lw=1.2)
         left.annotate(name, state.anchors[m, :2], xytext=(5, 5), textcoords="offset points")
     left.set_aspect("equal", adjustable="datalim")
-    left.set_title(f"95 % ellipses x {magnify:g}", fontsize=9)
-    left.set_xlabel("x [m]")
-    left.set_ylabel("y [m]")
-    left.legend(frameon=False, fontsize=8)
-    left.grid(alpha=0.25, lw=0.5)
+    left.set(xlabel="x [m]", ylabel="y [m]", title=f"95 % ellipses x {magnify:g}")
+    left.legend()
+    left.grid(True)
     e = found.survey.residuals
     by_anchor = [e[:, m][e[:, m] != 0] for m in range(len(found.anchor_ids))]
     if any(len(values) for values in by_anchor):
         right.boxplot(by_anchor, showfliers=False, whis=(2.5, 97.5))
         right.set_xticks(range(1, len(by_anchor) + 1), found.anchor_ids)
     right.axhline(0, color="0.4", lw=0.6)
-    right.set_xlabel("anchor")
-    right.set_ylabel("residual [m]: quartiles, 95 %")
-    right.grid(alpha=0.25, lw=0.5)
+    right.set(xlabel="anchor", ylabel="residual [m]: quartiles, 95 %")
+    right.grid(True)
     return figure
 
 
@@ -78,11 +75,10 @@ def _biases(axes: Any, found: CalibratedLinks) -> None:
             at[told], fit.bias_m[told, n], 2 * fit.bias_std_m[told, n], fmt="o", ms=4, label=tag
         )
     axes.set_xticks(range(len(found.anchor_ids)), found.anchor_ids)
-    axes.set_xlabel("anchor")
-    axes.set_ylabel("bias [m], 2 standard deviations")
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(xlabel="anchor", ylabel="bias [m], 2 standard deviations")
+    axes.grid(True)
     if len(found.tag_ids) <= 12:
-        axes.legend(title="tag", frameon=False, fontsize=8, ncols=4)
+        axes.legend(title="tag", ncols=4)
 
 
 def _over_distance(axes: Any, found: CalibratedLinks) -> None:
@@ -92,9 +88,8 @@ def _over_distance(axes: Any, found: CalibratedLinks) -> None:
     limit = 4 * float(np.median(found.fit.noise_std_m[found.fit.counts > 0]))
     axes.plot(d[at], np.clip(e[at], -limit, limit), ".", ms=1, color="#2e86ab", alpha=0.4)
     axes.axhline(0, color="0.4", lw=0.6)
-    axes.set_xlabel("distance [m]")
-    axes.set_ylabel(f"residual [m], cut at {limit:.2g}")
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(xlabel="distance [m]", ylabel=f"residual [m], cut at {limit:.2g}")
+    axes.grid(True)
 
 
 def _histogram(axes: Any, found: CalibratedLinks) -> None:
@@ -108,9 +103,8 @@ def _histogram(axes: Any, found: CalibratedLinks) -> None:
     bell = len(e) * width / std / np.sqrt(2 * np.pi) * np.exp(-0.5 * (middle / std) ** 2)
     axes.plot(middle, np.maximum(bell, 0.5), color="#d1495b", label=f"Gaussian, {std:.3f} m")
     axes.set_yscale("log")
-    axes.set_xlabel("residual [m], larger ones in the outermost bins")
-    axes.set_ylabel("ranges")
-    axes.legend(frameon=False, fontsize=8)
+    axes.set(xlabel="residual [m], larger ones in the outermost bins", ylabel="ranges")
+    axes.legend()
 
 
 def _directions(axes: Any, found: CalibratedLinks, end: str) -> None:
@@ -127,11 +121,13 @@ def _directions(axes: Any, found: CalibratedLinks, end: str) -> None:
         axes.plot(bearing, curve, lw=1.4, label=name)
     axes.set_xlim(-180, 180)
     axes.set_xticks(range(-180, 181, 60))
-    axes.set_xlabel(f"bearing of the ray at the {end} [deg], in the {frame}")
-    axes.set_ylabel("bias by direction [m]")
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(
+        xlabel=f"bearing of the ray at the {end} [deg], in the {frame}",
+        ylabel="bias by direction [m]",
+    )
+    axes.grid(True)
     if len(names) <= 12:
-        axes.legend(title=end, frameon=False, fontsize=8, ncols=4)
+        axes.legend(title=end, ncols=4)
 
 
 def _tags(axes: Any, found: CalibratedLinks) -> None:
@@ -141,6 +137,5 @@ def _tags(axes: Any, found: CalibratedLinks) -> None:
         axes.annotate(name, place[:2], xytext=(5, 5), textcoords="offset points", fontsize=8)
     axes.plot(0, 0, "k+", ms=9)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x in the truth's body frame [m]")
-    axes.set_ylabel("y [m]")
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(xlabel="x in the truth's body frame [m]", ylabel="y [m]")
+    axes.grid(True)

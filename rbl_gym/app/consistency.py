@@ -78,10 +78,9 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel("NIS / dof")
-    axes.set_xlabel("time [s]")
-    axes.legend(frameon=False, fontsize=7, loc="lower right")
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(xlabel="time [s]", ylabel="NIS / dof")
+    axes.legend(fontsize=7, loc="lower right")
+    axes.grid(True)
 
 
 def consistency_parts(replayed: Replayed) -> list[str]:

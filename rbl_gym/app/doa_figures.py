@@ -32,13 +32,12 @@ def doa2019_figure(result: dict[str, Any]) -> Figure:
                 values = np.where(np.array(method["near"]) > 0, method[key], np.nan)
                 ax.loglog(sigma, values, "o-", ms=4, lw=1.3, color=_COLOURS[name], label=name)
             ax.loglog(sigma, data["bound"][key], "k+--", ms=8, lw=0.8, label="CCRB")
-            ax.set_ylabel(title)
-            ax.set_title(f"{paper}{label}: trials near the truth", fontsize=9)
-            ax.grid(alpha=0.25, lw=0.5)
+            ax.set(ylabel=title, title=f"{paper}{label}: trials near the truth")
+            ax.grid(True)
         _successes(axes[row, 2], label, data, result["table_1"])
     for ax in axes[-1]:
         ax.set_xlabel("standard deviation of the angles [deg]")
-    axes[0, 0].legend(frameon=False, fontsize=8)
+    axes[0, 0].legend()
     return figure
 
 
@@ -56,9 +55,9 @@ def _successes(ax: Any, label: str, data: dict[str, Any], table_1: dict[str, Any
     if label == _PAPERS:
         ax.plot([], [], "D", mfc="w", mec="k", ms=4, label="Table 1")
     ax.set_xticks(places, [f"{sigma:g}" for sigma in data["sigma_deg"]])
-    ax.set_title(f"{label}: successes", fontsize=9)
+    ax.set_title(f"{label}: successes")
     ax.set(ylabel="near the truth [%]", ylim=(0, 122), yticks=range(0, 101, 20))
-    ax.legend(frameon=False, fontsize=8, loc="upper right", ncols=2)
+    ax.legend(loc="upper right", ncols=2)
 
 
 def print_doa2019(result: dict[str, Any]) -> None:

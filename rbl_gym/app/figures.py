@@ -40,8 +40,11 @@ _MAGNIFY = 20
 
 # Decorator of drawing functions: the user's matplotlib settings do not change outside.
 styled = matplotlib.rc_context(
-    {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-)
+    {
+        "font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False,
+        "legend.frameon": False, "legend.fontsize": 8, "grid.alpha": 0.25, "grid.linewidth": 0.5,
+    }
+)  # fmt: skip
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -101,13 +104,12 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
             ax.set_yscale("log")
             for axis_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
                 axis_formatter(ScalarFormatter())
-        ax.set_ylabel(label)
-        ax.set_xlabel("time step")
+        ax.set(xlabel="time step", ylabel=label)
         ax.set_xticks([1, 5, 10, 15, 20])
         prefix = title if of_paper or key == "nees" else "tracking: "
-        ax.set_title(f"{prefix}{result['trials']} trials", fontsize=9)
-        ax.grid(alpha=0.25, which="both", lw=0.5)
-    axes[0].legend(frameon=False, fontsize=8, ncols=2)
+        ax.set_title(f"{prefix}{result['trials']} trials")
+        ax.grid(True, which="both")
+    axes[0].legend(ncols=2)
     family = ", ".join(name for name in result["filters"] if name != "iterated EKF")
     axes[1].text(
         0.98,
@@ -143,10 +145,12 @@ def _trajectory(axes: Any, example: Example) -> None:
         zorder=3,
     )
     axes.set_aspect("equal", adjustable="box")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.set_title(f"one trial: 95 % beliefs and their errors x {_MAGNIFY}", fontsize=9)
-    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    axes.set(
+        xlabel="x [m]",
+        ylabel="y [m]",
+        title=f"one trial: 95 % beliefs and their errors x {_MAGNIFY}",
+    )
+    axes.legend(loc="upper left")
 
 
 def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
@@ -163,10 +167,12 @@ def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
                 textcoords="offset points",
                 fontsize=7,
             )
-    axes.set_xlabel("updates that project [%]")
-    axes.set_ylabel("rotation RMSE (Frobenius)")
-    axes.set_title("ET-KF: accuracy against projections, labelled by threshold", fontsize=9)
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.set(
+        xlabel="updates that project [%]",
+        ylabel="rotation RMSE (Frobenius)",
+        title="ET-KF: accuracy against projections, labelled by threshold",
+    )
+    axes.grid(True)
 
 
 def _errors(axes: Any, example: Example) -> None:
@@ -180,9 +186,11 @@ def _errors(axes: Any, example: Example) -> None:
     axes.axhline(0, color="0.5", lw=0.6)
     axes.set_xlabel("step")
     axes.set_xticks([1, 5, 10, 15, 20])
-    axes.set_ylabel("rotation error about z [deg]")
-    axes.set_title("the same trial: error and claimed 3-sigma band", fontsize=9)
-    axes.legend(frameon=False, fontsize=8)
+    axes.set(
+        ylabel="rotation error about z [deg]",
+        title="the same trial: error and claimed 3-sigma band",
+    )
+    axes.legend()
 
 
 @styled
@@ -236,10 +244,12 @@ def _static_panels(
                 "k+",
                 label="CRB, squared ranges",
             )
-            ax.grid(alpha=0.25, lw=0.5)
-            ax.set_title(f"anchors in {label}" if row == 0 else "", fontsize=9)
-            ax.set_xlabel("reference range [dB]" if row == 1 else "")
-            ax.set_ylabel(prefixes[row] + title if column == 0 else "")
+            ax.grid(True)
+            ax.set(
+                xlabel="reference range [dB]" if row == 1 else "",
+                ylabel=prefixes[row] + title if column == 0 else "",
+                title=f"anchors in {label}" if row == 0 else "",
+            )
 
 
 def _common_legend(figure: Figure, axes: Any) -> None:
@@ -253,8 +263,6 @@ def _common_legend(figure: Figure, axes: Any) -> None:
         handles.keys(),
         loc="outside lower center",
         ncols=5,
-        frameon=False,
-        fontsize=8,
     )
 
 
@@ -292,9 +300,8 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
         smoothed = replayed.smoothed.track.translation
         axes.plot(*smoothed[:, :2].T, color=COLOURS["KF"], lw=0.8, label="smoothed")
     axes.set_aspect("equal", adjustable="box")  # datalim would cut off the label
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     drawn = ((found, "iterated EKF"), (replayed.smoothed_errors, "KF"))
     for row, label in enumerate(labels):
         axes = figure.add_subplot(grid[row, 1])
@@ -305,9 +312,8 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
                     values = np.rad2deg(errors.yaw)
                 times = track.times[errors.known]
                 axes.plot(times, values[errors.known], color=COLOURS[colour], lw=0.8)
-        axes.set_ylabel(label)
-        axes.set_xlabel("time [s]")
-        axes.grid(alpha=0.25, lw=0.5)
+        axes.set(xlabel="time [s]", ylabel=label)
+        axes.grid(True)
     if track.innovations is not None:
         draw_nis(figure.add_subplot(grid[-1, 1]), replayed)
     return figure

@@ -37,11 +37,12 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                 color=_COLOURS[label],
             )
         axis.axhline(1.0, color="k", lw=0.8)
-        axis.set(yscale="log", title=name, ylabel="translation RMSE / clean bound")
+        axis.set(yscale="log", ylabel="translation RMSE / clean bound")
+        axis.set_title(name, fontsize="large")
         axis.set_xticks(
             range(len(conditions)), [label.replace(", ", ",\n") for label in conditions]
         )
-        axis.legend(frameon=False, loc="upper left")
+        axis.legend(fontsize="medium", loc="upper left")
     after = result["starts"]["after"]
     axes = lower.subplots(1, len(result["starts"]["scenes"]), squeeze=False)[0]
     for axis, (name, starts) in zip(axes, result["starts"]["scenes"].items(), strict=True):
@@ -56,9 +57,9 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                     ms=4,
                 )
         axis.set(xlabel="epochs later", ylabel="trials recovered [%]", ylim=(-3, 103))
-        axis.set_title(f"{name}: 180 degrees, 10 m off", fontsize=9)
+        axis.set_title(f"{name}: 180 degrees, 10 m off")
     handles = axes[-1].get_legend_handles_labels()
-    lower.legend(*handles, frameon=False, fontsize=9, loc="outside lower center", ncols=6)
+    lower.legend(*handles, fontsize=9, loc="outside lower center", ncols=6)
     return figure
 
 

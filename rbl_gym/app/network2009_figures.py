@@ -60,7 +60,7 @@ def _networks(axes: Any, result: dict[str, Any]) -> None:
         ax.margins(0.08)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set(xlabel="x", ylabel="y")
-        ax.set_title(title, fontsize=9)
+        ax.set_title(title)
 
 
 def _frames(ax: Axes, result: dict[str, Any]) -> None:
@@ -78,10 +78,8 @@ def _frames(ax: Axes, result: dict[str, Any]) -> None:
     ax.margins(0.15)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x", ylabel="y")
-    ax.set_title(
-        f"Fig. 6: frames, sigma^2 = {result['variance'][1]:g}, reference square", fontsize=9
-    )
-    ax.legend(frameon=False, fontsize=8, ncols=3, loc="lower center")
+    ax.set_title(f"Fig. 6: frames, sigma^2 = {result['variance'][1]:g}, reference square")
+    ax.legend(ncols=3, loc="lower center")
 
 
 def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
@@ -98,10 +96,8 @@ def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
         label="2 sigma^2 (n - 1) / m",
     )
     ax.set(xlabel="number of edges", ylabel="mean square error [rad^2]", ylim=(0, None))
-    ax.set_title(
-        f"Fig. 4: sigma^2 = {result['variance'][0]:g}, {result['trials']} trials", fontsize=9
-    )
-    ax.legend(frameon=False, fontsize=8)
+    ax.set_title(f"Fig. 4: sigma^2 = {result['variance'][0]:g}, {result['trials']} trials")
+    ax.legend()
 
 
 def _over_steps(axes: Any, result: dict[str, Any]) -> None:
@@ -109,13 +105,11 @@ def _over_steps(axes: Any, result: dict[str, Any]) -> None:
     run = result["run"]
     axes[0].plot(run["edge_angles"], lw=0.7)
     axes[0].set(xlabel="iteration", ylabel="angle estimate of every edge [rad]")
-    axes[0].set_title(
-        f"Fig. 5: kappa = {run['kappa']:.4f}, sigma^2 = {result['variance'][1]:g}", fontsize=9
-    )
+    axes[0].set_title(f"Fig. 5: kappa = {run['kappa']:.4f}, sigma^2 = {result['variance'][1]:g}")
     if run["loop_errors"]:
         axes[1].plot(run["loop_errors"], lw=0.7)
     axes[1].set(xlabel="iteration", ylabel="error of every loop [rad]")
-    axes[1].set_title("Fig. 5", fontsize=9)
+    axes[1].set_title("Fig. 5")
 
 
 def _growth(ax: Axes, name: str, data: dict[str, Any]) -> None:
@@ -135,8 +129,8 @@ def _growth(ax: Axes, name: str, data: dict[str, Any]) -> None:
     ax.set_xticks(nodes, [str(n) for n in nodes])
     ax.set(xlabel="n", ylabel="kappa")
     title = {"worst": "complete graph, cycles of a path", "triangulation": "triangulation"}[name]
-    ax.set_title(f"Section IV-E: {title}", fontsize=9)
-    ax.legend(frameon=False, fontsize=8)
+    ax.set_title(f"Section IV-E: {title}")
+    ax.legend()
 
 
 def _distance(ax: Axes, result: dict[str, Any]) -> None:
@@ -145,8 +139,8 @@ def _distance(ax: Axes, result: dict[str, Any]) -> None:
         ax.semilogy(distance, color=_COLOURS[basis], label=basis)
         ax.semilogy(history["printed_distance"], color=_COLOURS[basis], ls=":", lw=2)
     ax.set(xlabel="iteration", ylabel="distance from the limit [rad]", ylim=(1e-13, None))
-    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: as Theorem 19 prints", fontsize=9)
-    ax.legend(frameon=False, fontsize=8)
+    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: as Theorem 19 prints")
+    ax.legend()
 
 
 def _factors(ax: Axes, convergence: dict[str, Any]) -> None:
@@ -163,8 +157,8 @@ def _factors(ax: Axes, convergence: dict[str, Any]) -> None:
         ax.plot(places, [table[rule]["printed_factor_squared"] for rule in rules], "k_", ms=10)
     ax.set_xticks(range(len(rules)), rules)
     ax.set(xlabel="rule for kappa", ylabel="factor of the squared error", ylim=(0.4, 1.12))
-    ax.set_title("true (bars), (1 - kappa)^2 (dashes), means", fontsize=9)
-    ax.legend(frameon=False, ncols=3, loc="upper center", fontsize=8)
+    ax.set_title("true (bars), (1 - kappa)^2 (dashes), means")
+    ax.legend(ncols=3, loc="upper center")
 
 
 def _space(ax: Axes, rows: list[dict[str, Any]]) -> None:
@@ -174,8 +168,8 @@ def _space(ax: Axes, rows: list[dict[str, Any]]) -> None:
         (line,) = ax.loglog(sigma, [row["rmse_rad"] for row in chosen], mark, ms=5, label=shape)
         ax.loglog(sigma, [row["bound_rad"] for row in chosen], color=line.get_color(), lw=0.8)
     ax.set(xlabel="sigma of a bearing [rad]", ylabel="RMS turn against node 0 [rad]")
-    ax.set_title("three nodes in space; lines: bound", fontsize=9)
-    ax.legend(frameon=False, fontsize=8)
+    ax.set_title("three nodes in space; lines: bound")
+    ax.legend()
 
 
 def print_network2009(result: dict[str, Any]) -> None:

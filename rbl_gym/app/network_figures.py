@@ -32,8 +32,8 @@ def network_figure(solved: Solved) -> Figure:
     right.set(xlabel="residual of an edge [deg]", ylabel="edges")
     result = solved.result
     proof = "certified" if result["certified"] else "not certified"
-    left.set_title(f"{result['nodes']} nodes, {result['edges']} edges", fontsize=9)
-    right.set_title(f"chordal cost {result['chordal_cost']:.7g}, {proof}", fontsize=9)
+    left.set_title(f"{result['nodes']} nodes, {result['edges']} edges")
+    right.set_title(f"chordal cost {result['chordal_cost']:.7g}, {proof}")
     return figure
 
 
