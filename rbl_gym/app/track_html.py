@@ -106,48 +106,27 @@ def _thinned(count: int, most: int) -> np.ndarray:
 
 
 def _add_still(shown: go.Figure, story: Story) -> None:
-    shown.add_trace(
-        go.Scatter3d(
-            **solids.xyz(story.anchors),
-            mode="markers+text",
-            name="anchors",
-            text=list(story.names),
-            textposition="top center",
-            textfont={"size": 10},
-            hovertemplate="anchor %{text}<br>x %{x:.2f}, y %{y:.2f}, z %{z:.2f} m<extra></extra>",
-            marker={"size": 5, "color": ANCHOR, "symbol": "diamond"},
-        ),
+    shown.add_scatter3d(
+        **solids.xyz(story.anchors),
+        mode="markers+text",
+        name="anchors",
+        text=list(story.names),
+        textposition="top center",
+        textfont={"size": 10},
+        hovertemplate="anchor %{text}<br>x %{x:.2f}, y %{y:.2f}, z %{z:.2f} m<extra></extra>",
+        marker={"size": 5, "color": ANCHOR, "symbol": "diamond"},
         row=1,
         col=1,
     )
     points = _thinned(len(story.times), _POINTS)
     if story.truth is not None:
         _, places, known = story.truth
-        places = np.where(known[:, None], places, np.nan)[points]
-        shown.add_trace(
-            go.Scatter3d(
-                **solids.xyz(places),
-                mode="lines",
-                name="true path",
-                line={"color": "#868e96", "width": 5},
-                hoverinfo="skip",
-            ),
-            row=1,
-            col=1,
-        )
+        path = np.where(known[:, None], places, np.nan)[points]
+        shown.add_trace(_wire(path, "#868e96", "true path", 5, showlegend=True), row=1, col=1)
     for name, belief in story.beliefs.items():
-        shown.add_trace(
-            go.Scatter3d(
-                **solids.xyz(belief.translation[points]),
-                mode="lines",
-                name=name,
-                legendgroup=name,
-                hoverinfo="skip",
-                line={"color": belief.colour, "width": 2},
-            ),
-            row=1,
-            col=1,
-        )
+        style: dict[str, Any] = {"showlegend": True, "legendgroup": name}
+        path = _wire(belief.translation[points], belief.colour, name, 2, **style)
+        shown.add_trace(path, row=1, col=1)
 
 
 def _add_curves(shown: go.Figure, story: Story) -> None:
@@ -157,52 +136,28 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
     low, high = nees_interval(dof=freedom)
     for name, belief in story.beliefs.items():
         found = errors_of(story, belief)
-        for column, size, std in (
-            (1, found.position_m, found.position_std_m),
-            (3, found.rotation_deg, found.rotation_std_deg),
-        ):
-            shown.add_trace(
-                go.Scatter(
-                    x=times,
-                    y=solids.numbers(3 * std[points]),
-                    mode="lines",
-                    fill="tozeroy",
-                    fillcolor=_faint(belief.colour),
-                    line={"width": 0},
-                    name="3 sigma",
-                    legendgroup=name,
-                    showlegend=False,
-                    hoverinfo="skip",
-                ),
-                row=2,
-                col=column,
-            )
-            shown.add_trace(
-                go.Scatter(
-                    x=times,
-                    y=solids.numbers(size[points]),
-                    mode="lines",
-                    name=name,
-                    legendgroup=name,
-                    showlegend=False,
-                    line={"color": belief.colour, "width": 1.5},
-                ),
-                row=2,
-                col=column,
-            )
-        shown.add_trace(
-            go.Scatter(
+        style: dict[str, Any] = {
+            "mode": "lines",
+            "legendgroup": name,
+            "showlegend": False,
+            "row": 2,
+        }
+        for column, std in ((1, found.position_std_m), (3, found.rotation_std_deg)):
+            shown.add_scatter(
                 x=times,
-                y=solids.numbers(found.nees[points]),
-                mode="lines",
-                name=name,
-                legendgroup=name,
-                showlegend=False,
-                line={"color": belief.colour, "width": 1.5},
-            ),
-            row=2,
-            col=5,
-        )
+                y=solids.numbers(3 * std[points]),
+                fill="tozeroy",
+                fillcolor=_faint(belief.colour),
+                line={"width": 0},
+                name="3 sigma",
+                hoverinfo="skip",
+                col=column,
+                **style,
+            )
+        line = {"color": belief.colour, "width": 1.5}
+        for column, values in ((1, found.position_m), (3, found.rotation_deg), (5, found.nees)):
+            curve = solids.numbers(values[points])
+            shown.add_scatter(x=times, y=curve, name=name, line=line, col=column, **style)
     # Without this option plotly looks for two axes in the traces of 3-D scenes, too.
     where: dict[str, Any] = {"row": 2, "col": 5, "exclude_empty_subplots": False}
     grey = "#868e96"
