@@ -226,7 +226,16 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
 
 
 def scene_filter(scene: Scene, name: str, options: Mapping[str, Any], noise: Any = None) -> Filter:
-    """Return a named filter with the tags and laws of the scene; `noise` replaces that of ranges.
+    """Return a named filter with the tags and laws of the scene.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    name, options
+        As `estimators.make` takes them.
+    noise
+        Noise law in place of that of the scene's ranges; None: that law.
 
     Raises
     ------

@@ -71,7 +71,8 @@ def print_hard(result: dict[str, Any]) -> None:
             "rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)", "lost last",
             "ever", "largest (m)", "us / step",
         )  # fmt: skip
-        table = new_table(f"{name}, {result['trials']} trials", ["links", "filter"], headings)
+        title = f"{name}, {result['trials']} trials"
+        table = new_table(title, ["links", "filter"], headings, whole=2)
         for condition, row in conditions.items():
             for label, figures in row["filters"].items():
                 ratios = [

@@ -113,7 +113,7 @@ def print_place(result: dict[str, Any]) -> None:
     for warning in warnings(result):
         console.print(f"Note: {warning}")
     for rows in tables(result):
-        table = new_table(rows.title, rows.headings[:1], rows.headings[1:])
+        table = new_table(rows.title, rows.headings[:1], rows.headings[1:], whole=1)
         for row in rows.rows:
             table.add_row(*row)
         console.print(table)

@@ -37,7 +37,11 @@ def rich_console(**arguments: Any) -> Any:
 
 
 def new_table(
-    title: str | None, texts: Iterable[str], figures: Iterable[str] = (), notes: Iterable[str] = ()
+    title: str | None,
+    texts: Iterable[str],
+    figures: Iterable[str] = (),
+    notes: Iterable[str] = (),
+    whole: int = 0,
 ) -> Any:
     """Return a table for `new_console`: rich's, or plain text with the same methods.
 
@@ -47,7 +51,8 @@ def new_table(
         Title above the table; None: no title.
     texts, figures, notes
         Headings of the columns: texts on the left, then figures, aligned right, then further texts.
-        The first column is not wrapped.
+    whole
+        Number of columns, from the left, whose cells rich does not wrap.
     """
     if has_rich():
         from rich.table import Table
@@ -56,7 +61,7 @@ def new_table(
     else:
         table = _PlainTable(title)
     for index, heading in enumerate(texts):
-        table.add_column(heading, no_wrap=not index)
+        table.add_column(heading, no_wrap=index < whole)
     for heading in figures:
         table.add_column(heading, justify="right")
     for heading in notes:

@@ -225,6 +225,7 @@ def _write(out: Path, sheets: Mapping[str, Sheet]) -> dict[str, str]:
             f"{out / stale[0]} exists and does not come from this log: remove it or choose "
             "another folder"
         )
+    out.mkdir(parents=True, exist_ok=True)
     for name, sheet in sheets.items():
         write_table(out / name, sheet.header, sheet.rows)
     return {name: os.fspath(out / name) for name in sheets}
