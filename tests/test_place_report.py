@@ -167,7 +167,7 @@ def test_the_answer_is_in_words_and_signs(placed):
     assert zones[0].reached.startswith("100 % within (")
     assert zones[2].asks == zones[2].reached == ""
     assert place_answer.headline(placed.result) == "5 anchors: 1 of 2 zones meet their requirements"
-    assert place_answer.verdict(placed.result) == "fail"
+    assert placed.result["verdict"] == "fail"
     assert len(place_answer.question(placed.result)) == 3
 
 

@@ -29,21 +29,12 @@ class ZoneAnswer(NamedTuple):
     figures: str
 
 
-def verdict(result: dict[str, Any]) -> str:
-    """Return the verdict: ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``."""
-    found = [zone["verdict"] for zone in result["zones"]]
-    for one in ("fail", "undecided", "pass"):
-        if one in found:
-            return one
-    return "no requirement"
-
-
 def headline(result: dict[str, Any]) -> str:
     """Return one line: the number of anchors, and whether they suffice."""
     count = f"{result['n_anchors']} anchors"
     zones = result["zones"]
     asked = [zone for zone in zones if zone["verdict"] != "no requirement"]
-    overall = verdict(result)
+    overall = result["verdict"]
     if overall == "no requirement":
         return f"{count}: {typical(zones)}"
     met = sum(zone["verdict"] == "pass" for zone in asked)

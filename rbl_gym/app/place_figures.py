@@ -43,7 +43,7 @@ def place_figure(placed: Placed) -> Figure:
         groups.append((axes, map_panel(axes, placed, maps, quantity, index == 0)))
     axes = figure.add_subplot(grid[-1, len(panels) % 2 :])
     draw_chart(axes, result)
-    sign = place_answer.SIGNS[place_answer.verdict(result)].strip("-")
+    sign = place_answer.SIGNS[result["verdict"]].strip("-")
     title = f"{result['scene']}   {sign}   {place_answer.headline(result)}"
     figure.suptitle(title, fontsize=13)
     figure.supxlabel(legend_text(problem), fontsize=8, color="0.35")
@@ -140,7 +140,7 @@ def draw_chart(axes: Any, result: dict[str, Any]) -> None:
     """Draw accuracy against the number of anchors, or the usual layouts."""
     if "against_number" in result:
         _draw_numbers(axes, result["against_number"])
-    elif place_answer.verdict(result) == "no requirement":
+    elif result["verdict"] == "no requirement":
         _draw_scores(axes, result["layouts"])
     else:
         _draw_margins(axes, result)
@@ -171,7 +171,7 @@ def _draw_margins(axes: Any, result: dict[str, Any]) -> None:
     }
     names = sorted(margins, key=margins.__getitem__)
     verdicts = {name: row["verdict"] for name, row in rows.items()}
-    verdicts[own] = place_answer.verdict(result)
+    verdicts[own] = result["verdict"]
     texts = [f"{margins[name]:.2f}  {place_answer.SIGNS[verdicts[name]]}" for name in names]
     values = [margins[name] for name in names]
     _draw_bars(axes, names, values, texts, own, 1.45 * max(1.0, *values))

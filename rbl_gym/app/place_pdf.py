@@ -98,7 +98,7 @@ def _title_page(result: dict[str, Any]) -> Figure:
             page.text(_LEFT, y, part, fontsize=11)
     y -= 0.07
     page.text(_LEFT, y, "Answer", fontsize=12, fontweight="bold", color="0.35")
-    overall = place_answer.verdict(result)
+    overall = result["verdict"]
     y -= 0.055
     _badge(page, _LEFT, y, overall)
     page.text(

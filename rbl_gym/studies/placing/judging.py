@@ -216,12 +216,9 @@ def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
     """
     row = short_row(judged)
     for name, values in told(judged.judged).items():
-        row[name] = {
-            "rms": row.pop(f"rms_{name}"),
-            "median": float(np.median(values)),
-            "p95": float(np.quantile(values, 0.95)),
-            "worst": float(max(values.max(), told(edges.errors)[name].max(initial=0.0))),
-        }
+        del row[f"rms_{name}"]
+        worst = max(values.max(), told(edges.errors)[name].max(initial=0.0))
+        row[name] = {**_spread(values), "worst": float(worst)}
     inner = Judged(judged.zone, judged.places, judged.judged)
     return row | {"worst_places": worst_places(_joined(inner, edges))}
 
@@ -251,14 +248,17 @@ def overview(judged: list[Judged], edges: list[Judged]) -> dict[str, Any]:
         outer = unit * np.concatenate([getattr(one.errors, field) for one in edges])
         every = np.concatenate([values, outer])
         worst = int(every.argmax())
-        result[name] = {
-            "rms": float(rms(values)),
-            "median": float(np.median(values)),
-            "p95": float(np.quantile(values, 0.95)),
-            "worst": float(every[worst]),
-            "worst_at_m": places[worst].tolist(),
-        }
+        at = places[worst].tolist()
+        result[name] = {**_spread(values), "worst": float(every[worst]), "worst_at_m": at}
     return result
+
+
+def _spread(values: FloatArray) -> dict[str, float]:
+    return {
+        "rms": float(rms(values)),
+        "median": float(np.median(values)),
+        "p95": float(np.quantile(values, 0.95)),
+    }
 
 
 def at_edges(problem: Problem, anchors: FloatArray, judged: Judged) -> Judged:
