@@ -12,41 +12,17 @@ from rbl_gym.app.reports import compared, print_replay
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests.recorded import CORNERS, STD_M, STD_RAD, curve, honest_track
 
 pytest.importorskip("plotly", reason="needs the extra viz")
 from rbl_gym.app import track_pages
 
-STD_RAD, STD_M = 0.03, 0.03
-ANCHORS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
 TAGS = np.array([[0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]])
-
-
-def moving(times):
-    """Poses on a curve that speeds up and slows down, turns and tilts."""
-    turn = np.stack([0.3 * np.sin(0.7 * times), 0.2 * np.cos(times), 0.4 * times], axis=-1)
-    place = np.stack(
-        [3 + 2 * np.sin(0.5 * times), 3 + 1.5 * np.sin(0.8 * times), 1 + 0.4 * np.cos(times)], -1
-    )
-    return rotations.exp(turn), place
-
-
-def pair(truth, seed=0, duration_s=20.0):
-    """A recording with this truth, and an honest track of the curve."""
-    rng = np.random.default_rng(seed)
-    times = np.arange(0, duration_s, 0.1)
-    rotation, place = moving(times)
-    rotation = rotations.exp(STD_RAD * rng.standard_normal(place.shape)) @ rotation
-    place = place + STD_M * rng.standard_normal(place.shape)
-    P = np.diag([STD_RAD**2] * 3 + [STD_M**2] * 3)
-    track = replay.Track(times, rotation, place, np.tile(P, (len(times), 1, 1)))
-    links = np.ones((len(times), 4, 3), bool)
-    ids = tuple("abcd"), tuple("xyz")
-    return Recording(times, 5.0 * links, links, None, ANCHORS, TAGS, *ids, truth), track
 
 
 def replayed(truth, **settings) -> tuple[Recording, Any]:
     """As `replay.replay_recording`, of a track that is given."""
-    recording, track = pair(truth)
+    recording, track = honest_track(truth, np.arange(0, 20, 0.1), TAGS)
     chosen = replay.Settings.of(**settings)
     found = replay.track_errors(recording, track, chosen)
     figures = replay.track_figures(recording, track, found, chosen)
@@ -54,7 +30,7 @@ def replayed(truth, **settings) -> tuple[Recording, Any]:
 
 
 TIMES = np.arange(-1, 22, 0.02)
-ROTATION, PLACE = moving(TIMES)
+ROTATION, PLACE = curve(TIMES)
 TURN = rotations.exp([0.5, -0.4, 1.0])
 SHIFT = np.array([10.0, -4.0, 2.0])
 
@@ -144,7 +120,7 @@ def test_a_clock_that_is_ahead():
 def test_a_clock_is_found_by_the_motion(align, ahead_s, with_rotation):
     R = TURN if align == "se3" else np.eye(3)
     truth = Truth(TIMES + ahead_s, R @ ROTATION if with_rotation else None, PLACE @ R.T)
-    recording, track = pair(truth)
+    recording, track = honest_track(truth, np.arange(0, 20, 0.1), TAGS)
     chosen = replay.Settings.of(time_offset="auto", align=align)
     found = replay.find_offset(recording, track, chosen)
     assert found is not None
@@ -159,8 +135,8 @@ def test_a_run_finds_the_clock_by_its_own_track():
     """Of a smoothed track, which does not lag."""
     rng = np.random.default_rng(0)
     times = np.arange(0, 12, 0.1)
-    rotation, place = moving(times)
-    anchors = np.concatenate([ANCHORS, [[4, 4, 3.5], [1, 6, 0.5]]])
+    rotation, place = curve(times)
+    anchors = np.concatenate([CORNERS, [[4, 4, 3.5], [1, 6, 0.5]]])
     tags = (rotation @ TAGS.T).swapaxes(1, 2) + place[:, None]
     ranges = np.linalg.norm(anchors[:, None] - tags[:, None], axis=-1)
     ranges = ranges + 0.03 * rng.standard_normal(ranges.shape)

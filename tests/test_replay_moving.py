@@ -5,43 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import motion
 from rbl_gym.geometry import rotations
-from rbl_gym.measurements import ranging
-from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from tests.helpers import with_kernels
+from tests.recorded import ROOM, flight, swaying
 
-ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
 TAGS = np.array([[0.3, 0.2, 0], [-0.3, 0.2, 0], [-0.3, -0.2, 0.05], [0.3, -0.2, 0.25]])
 SETTINGS = replay.Settings.of(walk_m=0.3, walk_deg=20.0, range_std_m=0.05)
 
 
-def recording(move, tags=TAGS, count=60) -> Recording:
-    """A body that turns and flies through a room, its anchors at ``move(times)`` (K, M, 3)."""
-    rng = np.random.default_rng(1)
-    twists = motion.constant_twist(np.eye(3), [2, 2, 1.2], [0.0, 0, 0.3, 0.4, 0.1, 0], count - 1)
-    path = motion.simulate(twists, 0.1, motion.ProcessNoise())
-    times = 0.1 * np.arange(count)
-    anchors = np.broadcast_to(move(times), (count, len(ROOM), 3))
-    points = ranging.tag_positions(path.rotation, path.translation, tags)
-    exact = np.linalg.norm(anchors[:, :, None] - points[:, None], axis=-1)
-    ranges = exact + 0.05 * rng.standard_normal(exact.shape)
-    ids = tuple(map(str, range(len(ROOM)))), tuple(map(str, range(len(tags))))
-    truth = Truth(times, path.rotation, path.translation)
-    return Recording(times, ranges, ranges > 0, None, np.array(anchors), tags, *ids, truth)
-
-
-def swaying(times: np.ndarray) -> np.ndarray:
-    """Each anchor on a circle of 1 m."""
-    phase = times[:, None] + np.arange(len(ROOM))
-    circle = np.stack([np.cos(phase), np.sin(phase), np.zeros_like(phase)], axis=-1)
-    return ROOM + circle
+def standing(times):
+    """The anchors told at every epoch."""
+    return np.tile(ROOM, (len(times), 1, 1))
 
 
 @pytest.mark.parametrize("options", [{}, {"volume": (0, 8, 0, 6, 0, 3)}, {"below_anchors": True}])
 def test_anchors_that_stand_may_be_told_at_every_epoch(options):
-    log = recording(lambda times: ROOM)
+    log = flight(TAGS, standing)
     settings = SETTINGS.changed(**options)
     want = replay.replay_recording(log._replace(anchors=ROOM), settings)
     got = replay.replay_recording(log, settings)
@@ -52,7 +32,7 @@ def test_anchors_that_stand_may_be_told_at_every_epoch(options):
 @with_kernels
 def test_a_track_among_anchors_that_move():
     """0.05 m a range, 24 ranges an epoch: some centimetres; a metre off if they were held still."""
-    log = recording(swaying)
+    log = flight(TAGS, swaying)
     moving = replay.replay_recording(log, SETTINGS).figures
     assert moving["position_rmse_m"] < 0.06
     still = replay.replay_recording(log._replace(anchors=log.anchors[0]), SETTINGS).figures
@@ -62,7 +42,7 @@ def test_a_track_among_anchors_that_move():
 def test_a_map_and_anchors_that_move():
     """Coordinates of a map are taken relative to all places of the anchors."""
     shift = np.array([448_262.0, 5_411_932.0, 310.0])
-    log = recording(swaying)
+    log = flight(TAGS, swaying)
     assert log.truth is not None
     there = log._replace(
         anchors=log.anchors + shift,
@@ -82,14 +62,14 @@ def test_a_flat_array_on_a_body_that_moves_is_planar():
         place = np.stack([4 - 0.2 * times, 1 + 0 * times, 1.2 + 0 * times], axis=-1)
         return (turn @ arms.T).swapaxes(1, 2) + place[:, None]
 
-    log = recording(carried, TAGS * (1, 1, 0))
+    log = flight(TAGS * (1, 1, 0), carried)
     figures = replay.replay_recording(log, SETTINGS.changed(planar=True)).figures
     assert figures["position_median_m"] < 0.3
 
 
 def test_runs_are_replayed_each_from_its_own_start():
     """Errors together are those of all epochs; a run without truth counts its epochs alone."""
-    logs = {"a": recording(lambda times: ROOM), "b": recording(swaying, count=30)}
+    logs = {"a": flight(TAGS, standing), "b": flight(TAGS, swaying, count=30)}
     logs["none"] = logs["a"]._replace(truth=None)
     found = replay.replay_runs(logs, SETTINGS)
     alone = {run: replay.replay_recording(log, SETTINGS) for run, log in logs.items()}

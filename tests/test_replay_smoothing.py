@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rbl_gym import motion, recordings
+from rbl_gym import recordings
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import bodies
-from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from tests.helpers import with_kernels
+from tests.recorded import ROOM, flight, swaying
 
 REAL = Path(__file__).parents[2] / "shared" / "data"
 LIAS, LABYRINTH = REAL / "lias_planar", REAL / "labyrinth_single_tag"
-ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
 TAGS = bodies.octahedron(0.8)
 SMOOTH = replay.Settings.of(
     walk_m=0.4,
@@ -30,30 +29,8 @@ SMOOTH = replay.Settings.of(
 )
 
 
-def recording(move=lambda times: ROOM, tags=TAGS, biases=0.0, count=60, shift=0.0) -> Recording:
-    """A body that turns and flies through a room, its anchors at ``move(times)``."""
-    rng = np.random.default_rng(1)
-    twists = motion.constant_twist(np.eye(3), [2, 2, 1.2], [0.0, 0, 0.3, 0.4, 0.1, 0], count - 1)
-    path = motion.simulate(twists, 0.1, motion.ProcessNoise())
-    times = 0.1 * np.arange(count)
-    anchors = np.array(move(times))
-    points = ranging.tag_positions(path.rotation, path.translation, tags)
-    exact = ranging.distances(anchors, points)
-    off = biases * rng.standard_normal(exact.shape[1:])
-    ranges = exact + off + 0.05 * rng.standard_normal(exact.shape)
-    ids = tuple(map(str, range(len(ROOM)))), tuple(map(str, range(len(tags))))
-    truth = Truth(times, path.rotation, path.translation + shift)
-    return Recording(times, ranges, ranges > 0, None, anchors + shift, tags, *ids, truth)
-
-
-def swaying(times: np.ndarray) -> np.ndarray:
-    """Each anchor on a circle of 1 m."""
-    phase = times[:, None] + np.arange(len(ROOM))
-    return ROOM + np.stack([np.cos(phase), np.sin(phase), np.zeros_like(phase)], axis=-1)
-
-
 def test_smoothed_is_nearer_than_causal_and_honest():
-    replayed = replay.replay_recording(recording(biases=0.05), SMOOTH)
+    replayed = replay.replay_recording(flight(TAGS, biases=0.05), SMOOTH)
     smoothed = replayed.figures["smoothed"]
     assert isinstance(replayed.smoothed, replay.SmoothedRecording)
     assert smoothed["converged"]
@@ -64,14 +41,15 @@ def test_smoothed_is_nearer_than_causal_and_honest():
     found = np.array(smoothed["mean_bias_m"])
     np.testing.assert_allclose(found, replayed.smoothed.found.biases.mean(axis=0))
     assert (
-        "smoothed" not in replay.replay_recording(recording(), SMOOTH.changed(smooth=False)).figures
+        "smoothed"
+        not in replay.replay_recording(flight(TAGS), SMOOTH.changed(smooth=False)).figures
     )
 
 
 def test_moving_anchors_and_coordinates_of_a_map():
-    near = replay.replay_recording(recording(swaying), SMOOTH)
+    near = replay.replay_recording(flight(TAGS, swaying), SMOOTH)
     assert near.figures["smoothed"]["position_rmse_m"] < 0.05
-    far = replay.replay_recording(recording(swaying, shift=4e5), SMOOTH)
+    far = replay.replay_recording(flight(TAGS, swaying, shift=4e5), SMOOTH)
     assert near.smoothed is not None
     assert far.smoothed is not None
     np.testing.assert_allclose(
@@ -80,7 +58,7 @@ def test_moving_anchors_and_coordinates_of_a_map():
 
 
 def test_a_start_that_lost_its_way_is_replaced():
-    log, settings = recording(), SMOOTH
+    log, settings = flight(TAGS), SMOOTH
     track = replay.track_recording(log, settings)
     good = replay.smooth_recording(log, settings, track)
     # Behind the wall, upside down.
@@ -92,7 +70,7 @@ def test_a_start_that_lost_its_way_is_replaced():
 
 
 def test_what_does_not_fit_into_memory_is_refused():
-    log = recording(count=40)
+    log = flight(TAGS, count=40)
     track = replay.track_recording(log, SMOOTH)
     long = log._replace(
         times=np.arange(400000.0),
@@ -113,7 +91,7 @@ def test_laws_that_cannot_be_are_named(options):
 
 @with_kernels
 def test_soft_knowledge_and_the_loss_for_late_ranges():
-    log = recording()
+    log = flight(TAGS)
     log = log._replace(
         ranges=log.ranges + 2.0 * (np.random.default_rng(3).random(log.ranges.shape) < 0.1)
     )
@@ -132,7 +110,7 @@ def table(path: Path, header: str, rows) -> str:
 
 
 def test_the_command_prints_both_tracks(tmp_path, capsys):
-    log = recording(count=20)
+    log = flight(TAGS, count=20)
     links = np.ndenumerate(log.ranges)
     files = {
         "ranges": table(

@@ -10,36 +10,21 @@ import pytest
 
 from rbl_gym import motion, recordings
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings import Recording, Truth
+from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay.truth import check_overlap, matched, stamp_hints
-
-STD_RAD, STD_M = 0.03, 0.03
-ANCHORS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
+from tests.recorded import curve, honest_track
 
 
 def moving(step_s, duration_s=10.0, start_s=0.0):
-    """Times and poses on a curve that speeds up and slows down, turns and tilts."""
+    """Times and poses of `curve`."""
     times = np.arange(start_s, duration_s, step_s)
-    turn = np.stack([0.3 * np.sin(0.7 * times), 0.2 * np.cos(times), 0.4 * times], axis=-1)
-    place = np.stack(
-        [3 + 2 * np.sin(0.5 * times), 3 + 1.5 * np.sin(0.8 * times), 1 + 0.4 * np.cos(times)], -1
-    )
-    return times, rotations.exp(turn), place
+    return times, *curve(times)
 
 
 def pair(truth, step_s=0.1, seed=0):
-    """A recording with this truth, and an honest track of the curve."""
-    rng = np.random.default_rng(seed)
-    times, rotation, place = moving(step_s)
-    rotation = rotations.exp(STD_RAD * rng.standard_normal(place.shape)) @ rotation
-    place = place + STD_M * rng.standard_normal(place.shape)
-    P = np.diag([STD_RAD**2] * 3 + [STD_M**2] * 3)
-    track = replay.Track(times, rotation, place, np.tile(P, (len(times), 1, 1)))
-    links = np.ones((len(times), 4, 1), bool)
-    ids = tuple("abcd"), ("t",)
-    recording = Recording(times, 5.0 * links, links, None, ANCHORS, np.zeros((1, 3)), *ids, truth)
-    return recording, track
+    """A recording with this truth and one tag, and an honest track of the curve."""
+    return honest_track(truth, np.arange(0, 10, step_s), np.zeros((1, 3)), seed)
 
 
 def outcome(truth, settings=replay.Settings(), **options):  # noqa: B008

@@ -1,0 +1,60 @@
+"""Recordings of simulated bodies, for tests of replay."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym import motion
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings import Recording, Truth
+from rbl_gym.studies import replay
+
+ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
+# Of `honest_track`.
+STD_RAD, STD_M = 0.03, 0.03
+CORNERS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
+
+
+def flight(tags, move=lambda times: ROOM, biases=0.0, count=60, shift=0.0) -> Recording:
+    """A body that turns and flies through a room, its anchors at ``move(times)``."""
+    rng = np.random.default_rng(1)
+    twists = motion.constant_twist(np.eye(3), [2, 2, 1.2], [0.0, 0, 0.3, 0.4, 0.1, 0], count - 1)
+    path = motion.simulate(twists, 0.1, motion.ProcessNoise())
+    times = 0.1 * np.arange(count)
+    anchors = np.array(move(times))
+    points = ranging.tag_positions(path.rotation, path.translation, tags)
+    exact = ranging.distances(anchors, points)
+    off = biases * rng.standard_normal(exact.shape[1:])
+    ranges = exact + off + 0.05 * rng.standard_normal(exact.shape)
+    ids = tuple(map(str, range(len(ROOM)))), tuple(map(str, range(len(tags))))
+    truth = Truth(times, path.rotation, path.translation + shift)
+    return Recording(times, ranges, ranges > 0, None, anchors + shift, tags, *ids, truth)
+
+
+def swaying(times: np.ndarray) -> np.ndarray:
+    """Each anchor of `flight` on a circle of 1 m."""
+    phase = times[:, None] + np.arange(len(ROOM))
+    return ROOM + np.stack([np.cos(phase), np.sin(phase), np.zeros_like(phase)], axis=-1)
+
+
+def curve(times):
+    """Poses on a curve that speeds up and slows down, turns and tilts."""
+    turn = np.stack([0.3 * np.sin(0.7 * times), 0.2 * np.cos(times), 0.4 * times], axis=-1)
+    place = np.stack(
+        [3 + 2 * np.sin(0.5 * times), 3 + 1.5 * np.sin(0.8 * times), 1 + 0.4 * np.cos(times)], -1
+    )
+    return rotations.exp(turn), place
+
+
+def honest_track(truth, times, tags, seed=0):
+    """A recording with this truth, and a track of `curve` with the errors it expects."""
+    rng = np.random.default_rng(seed)
+    rotation, place = curve(times)
+    rotation = rotations.exp(STD_RAD * rng.standard_normal(place.shape)) @ rotation
+    place = place + STD_M * rng.standard_normal(place.shape)
+    P = np.diag([STD_RAD**2] * 3 + [STD_M**2] * 3)
+    track = replay.Track(times, rotation, place, np.tile(P, (len(times), 1, 1)))
+    links = np.ones((len(times), len(CORNERS), len(tags)), bool)
+    ids = tuple("abcd"), tuple(map(str, range(len(tags))))
+    return Recording(times, 5.0 * links, links, None, CORNERS, tags, *ids, truth), track
