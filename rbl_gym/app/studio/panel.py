@@ -160,12 +160,11 @@ class Panel:
         """Connect a callback that runs if a user changes an input, but not if `show` does."""
         asked = self._asked[id(handle)] = deque(maxlen=_MOST_ASKED)
 
-        def changed(event: Any) -> None:
-            if event.client is not None:
-                asked.append(handle.value)
-                call()
+        def changed() -> None:
+            asked.append(handle.value)
+            call()
 
-        handle.on_update(changed)
+        when_changed(handle, changed)
 
     def _fill(self, handle: Any, value: Any) -> None:
         """Show a value in an input, unless a user asked for it.
@@ -257,6 +256,16 @@ def _range(value: float, most: float) -> tuple[float, float, float]:
 
 def _anchor_name(state: State, index: int) -> str:
     return f"{index + 1}  fixed" if state.fixed[index] else f"{index + 1}"
+
+
+def when_changed(handle: Any, call: Callable[[], None]) -> None:
+    """Connect a callback that runs if a user changes an input, but not if the page does."""
+
+    def changed(event: Any) -> None:
+        if event.client is not None:
+            call()
+
+    handle.on_update(changed)
 
 
 def _text(text: str) -> str:

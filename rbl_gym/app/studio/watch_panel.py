@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.app.studio.panel import length
+from rbl_gym.app.studio.panel import length, when_changed
 from rbl_gym.app.studio.watch_view import FILTERS, GHOSTS, LINK_COLOURS, TRUTH, swatches
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.watching.frames import LINKS, Frame
@@ -89,7 +89,7 @@ class WatchPanel:
         move = gui.add_button_group("", ("Step", "Restart"))
         move.on_click(lambda _: actions[move.value.lower()]())
         self._time = gui.add_slider("Epoch", 0, 1, 1, 0)
-        _input(self._time, lambda: actions["seek"](int(self._time.value)))
+        when_changed(self._time, lambda: actions["seek"](int(self._time.value)))
         speed = gui.add_button_group("Speed", ("0.5x", "1x", "4x", "max"))
         factors = {"0.5x": 0.5, "1x": 1.0, "4x": 4.0, "max": np.inf}
         speed.on_click(lambda _: actions["speed"](factors[speed.value]))
@@ -98,10 +98,10 @@ class WatchPanel:
                 self._add_disturbances(gui, actions["disturb"])
         with gui.add_folder("View"):
             follow = gui.add_checkbox("Follow body", False)
-            _input(follow, lambda: actions["follow"](bool(follow.value)))
+            when_changed(follow, lambda: actions["follow"](bool(follow.value)))
             self._seen_by = gui.add_dropdown("Links of", self._filters or (NONE,))
             self._seen_by.visible = len(self._filters) > 1
-            _input(
+            when_changed(
                 self._seen_by, lambda: actions["links"](self._filters.index(self._seen_by.value))
             )
             gui.add_html(_legend())
@@ -142,7 +142,7 @@ class WatchPanel:
             )
 
         for handle in handles:
-            _input(handle, changed)
+            when_changed(handle, changed)
         calm = gui.add_button("None of these", color="gray")
         calm.on_click(lambda _: disturb(CALM))
 
@@ -162,7 +162,7 @@ class WatchPanel:
             begin(chosen([box.value for box in boxes], program.filters), int(seed.value))
 
         for handle in (*boxes, seed):
-            _input(handle, changed)
+            when_changed(handle, changed)
 
     def _chart(self, gui: Any, name: str) -> Any:
         from viser import uplot
@@ -234,16 +234,6 @@ class WatchPanel:
         self._seen_by.visible = len(labels) > 1
         for chart in self._charts:
             chart.data, chart.series = self._curves((), 0.0, lambda _: np.nan)
-
-
-def _input(handle: Any, call: Callable[[], None]) -> None:
-    """Connect a callback that runs if a user changes an input, but not if the page does."""
-
-    def changed(event: Any) -> None:
-        if event.client is not None:
-            call()
-
-    handle.on_update(changed)
 
 
 def headline(title: str, frames: Sequence[Frame]) -> str:
