@@ -99,11 +99,6 @@ def extended(tags: FloatArray) -> FloatArray:
     return np.concatenate([tags, np.ones((*tags.shape[:-1], 1))], axis=-1)
 
 
-def paper_matrices(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """Return G (..., 3, 3) and ``B = sum_n b_n c_e^T`` (..., 3, 4) for common weights."""
-    return stat.G[..., 0, :, :], np.swapaxes(stat.b, -1, -2) @ extended(stat.tags)
-
-
 def information(stat: Statistic) -> tuple[FloatArray, FloatArray]:
     """Return the information matrix (..., 12, 12) and vector (..., 12) about ``x = [vec Q; t]``."""
     ce = extended(stat.tags)

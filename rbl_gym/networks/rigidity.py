@@ -16,7 +16,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_one_of
+from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.geometry import rotations
 from rbl_gym.networks.bounds import (
     bearing_jacobian,
@@ -54,31 +54,6 @@ class Localizability(NamedTuple):
     def frames(self) -> bool:
         """Return whether all frames are determined if one length is known."""
         return self.orientations and self.rank == self.full_rank
-
-
-def check_orientations(edges: ArrayLike, n_nodes: int, measured: str = "bearings") -> None:
-    """Raise ValueError unless the measurements determine all orientations.
-
-    Parameters
-    ----------
-    edges, n_nodes
-        (m, 2), the measuring pairs, and the number of nodes.
-    measured
-        ``"bearings"``, ``"both"`` or ``"ranges"``. Ranges alone do not determine orientations:
-        rotating a node changes none (Proposition 15).
-
-    Raises
-    ------
-    ValueError
-        If they do not; the message names the components.
-    """
-    check_one_of("measured", measured, ("bearings", "ranges", "both"))
-    check_connected(edges, n_nodes)
-    if measured == "ranges" and n_nodes > 1:
-        raise ValueError(
-            "orientations are not localizable from ranges alone, as turning a node changes no "
-            "range: measured must be 'bearings' or 'both', got 'ranges'"
-        )
 
 
 def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
