@@ -82,7 +82,7 @@ def plan_part(placed: Placed) -> str:
         f'<figure class="plan">{_controls(panels, levels)}'
         f'<div class="stage" style="aspect-ratio: {size[0]:.1f} / {size[1]:.1f}">{svg}'
         f"{_labels(placed, edges)}</div>"
-        f"{''.join(_scale(problem, q, ranges[q.field], maps) for q in panels)}"
+        f"{''.join(_scale(problem, q, ranges[q.field]) for q in panels)}"
         f'<p class="note">{html.escape(" · ".join(legend_text(problem).split("     ")))}</p>'
         '<p class="readout">Touch the map or an anchor to see its values.</p>'
         f'<script type="application/json">{_data(placed, panels, maps, edges, middle)}</script>'
@@ -279,9 +279,7 @@ def _uri(image: Any) -> str:
     return "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()
 
 
-def _scale(
-    problem: Any, quantity: shapes.Quantity, span: tuple[float, float], maps: list[list[Map]]
-) -> str:
+def _scale(problem: Any, quantity: shapes.Quantity, span: tuple[float, float]) -> str:
     """Return the legend of a map."""
     if quantity.field == "relative":
         keys = [

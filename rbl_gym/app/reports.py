@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from rbl_gym.app.consistency import print_consistency
@@ -87,9 +88,6 @@ def print_slides2013(result: dict[str, Any]) -> None:
     print_camsap2013(result["dynamic"])
 
 
-_SHOWN = {"centre": "tags' centre", "axis": "tags' line"}
-
-
 def print_replay(result: dict[str, Any]) -> None:
     """Print the figures of a recording, one per line."""
     console = new_console()
@@ -121,18 +119,21 @@ def print_replay(result: dict[str, Any]) -> None:
     _print_notes(console, result)
 
 
-def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -> None:
-    table = new_table(None, [title], ["RMSE", "median", "p95"])
+def error_rows(result: dict[str, Any], axes: str) -> Iterator[tuple[str, int, list[float]]]:
+    """Return label, number of decimals, and RMSE, median and p95 of every known error."""
+    shown = {"position": f"position {axes}", "centre": "tags' centre", "axis": "tags' line"}
     for name, unit, places in (
         ("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2), ("centre", "m", 4),
         ("axis", "deg", 2),
     ):  # fmt: skip
-        if f"{name}_rmse_{unit}" not in result:
-            continue
-        label = (
-            f"position {axes} (m)" if name == "position" else f"{_SHOWN.get(name, name)} ({unit})"
-        )
-        values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
+        if f"{name}_rmse_{unit}" in result:
+            values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
+            yield f"{shown.get(name, name)} ({unit})", places, values
+
+
+def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -> None:
+    table = new_table(None, [title], ["RMSE", "median", "p95"])
+    for label, places, values in error_rows(result, axes):
         table.add_row(label, *(f"{value:.{places}f}" for value in values))
     console.print(table)
     mean = f"mean yaw error {result['yaw_mean_deg']:.2f} deg, " if "yaw_mean_deg" in result else ""

@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 from rbl_gym.app import page, track_html
 from rbl_gym.app.consistency import consistency_parts
 from rbl_gym.app.figures import COLOURS
-from rbl_gym.app.reports import CAMSAP_COLUMNS, compared
+from rbl_gym.app.reports import CAMSAP_COLUMNS, compared, error_rows
 from rbl_gym.app.story import Beliefs, Story
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
@@ -160,20 +160,8 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         parts.append(page.note(f"Coordinates are relative to ({shift}) m."))
     parts.append(page.plot(track_html.track_figure(story), "track"))
     if truth is not None:
-        rows = [
-            [
-                f"{name} {result['position_axes']} (m)" if unit == "m" else f"{name} (deg)",
-                *(result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")),
-            ]
-            for name, unit in (
-                ("position", "m"),
-                ("yaw", "deg"),
-                ("rotation", "deg"),
-                ("centre", "m"),
-                ("axis", "deg"),
-            )
-            if f"{name}_rmse_{unit}" in result
-        ]
+        found = error_rows(result, result["position_axes"])
+        rows = [[label, *values] for label, _, values in found]
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
         parts.append(
             page.note(
