@@ -92,19 +92,17 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
                 at = filters.index(row["filter"]), conditions.index(row["condition"])
                 ratio[at] = row["tags_m"].get("to_bound") or np.nan
         text = [["" if np.isnan(r) else page.digits(r, 3) for r in line] for line in ratio]
-        shown.add_trace(
-            go.Heatmap(
-                z=np.log10(ratio),
-                x=conditions,
-                y=filters,
-                text=text,
-                texttemplate="%{text}",
-                coloraxis="coloraxis",
-                hoverongaps=False,
-                hovertemplate="%{y}, %{x}: %{text} x bound<extra>" + scene + "</extra>",
-            ),
-            1 + k // columns,
-            1 + k % columns,
+        shown.add_heatmap(
+            z=np.log10(ratio),
+            x=conditions,
+            y=filters,
+            text=text,
+            texttemplate="%{text}",
+            coloraxis="coloraxis",
+            hoverongaps=False,
+            hovertemplate="%{y}, %{x}: %{text} x bound<extra>" + scene + "</extra>",
+            row=1 + k // columns,
+            col=1 + k % columns,
         )
     ticks = [1, 2, 5, 10, _LOST_RATIO]
     shown.update_layout(

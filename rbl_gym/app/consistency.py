@@ -129,7 +129,6 @@ def consistency_parts(replayed: Replayed) -> list[str]:
 
 def _charts(replayed: Replayed) -> Any:
     """Return charts of NIS over time, mean residual and rejected fraction of every link."""
-    from plotly import graph_objects as go
     from plotly.subplots import make_subplots
 
     track, found = replayed.track, replayed.track.innovations
@@ -144,12 +143,10 @@ def _charts(replayed: Replayed) -> Any:
         subplot_titles=["NIS per degree of freedom", "mean residual (m)", "refused (%)"],
     )
     for values, fill in ((high, None), (low, "tonexty")):
-        band = {"color": _BAND, "width": 0}
-        shown.add_trace(
-            go.Scatter(x=when, y=values, mode="lines", line=band, fill=fill, hoverinfo="skip"), 1, 1
-        )
+        style: dict[str, Any] = {"mode": "lines", "line": {"color": _BAND, "width": 0}}
+        shown.add_scatter(x=when, y=values, fill=fill, hoverinfo="skip", row=1, col=1, **style)
     line = {"color": _HONEST, "width": 1.2}
-    shown.add_trace(go.Scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line), 1, 1)
+    shown.add_scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line, row=1, col=1)
     shown.update_yaxes(type="log", dtick=1, row=1, col=1)
     shown.update_xaxes(title_text="time (s)", title_standoff=4, row=1, col=1)
     rows = replayed.figures["consistency"]["residuals"]["links"]
@@ -166,20 +163,18 @@ def _charts(replayed: Replayed) -> Any:
         (3, refused, "Reds", (0.0, max(float(np.nanmax(refused, initial=0.0)), 1.0)),
          "xaxis3"),
     ):  # fmt: skip
-        shown.add_trace(
-            go.Heatmap(
-                z=values,
-                x=[f"tag {tag}" for tag in tags],
-                y=[f"anchor {anchor}" for anchor in anchors],
-                colorscale=scale,
-                reversescale=scale == "RdBu",
-                zmin=ends[0],
-                zmax=ends[1],
-                colorbar={"x": layout[axis].domain[1], "thickness": 10, "len": 0.9},
-                hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
-            ),
-            1,
-            column,
+        shown.add_heatmap(
+            z=values,
+            x=[f"tag {tag}" for tag in tags],
+            y=[f"anchor {anchor}" for anchor in anchors],
+            colorscale=scale,
+            reversescale=scale == "RdBu",
+            zmin=ends[0],
+            zmax=ends[1],
+            colorbar={"x": layout[axis].domain[1], "thickness": 10, "len": 0.9},
+            hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
+            row=1,
+            col=column,
         )
         shown.update_yaxes(autorange="reversed", row=1, col=column)
     shown.update_annotations(font_size=13)

@@ -95,21 +95,16 @@ def _curves(result: dict[str, Any]) -> go.Figure:
             lines["estimated by KF"] = (estimated, "#868e96", "markers")
             lines["posterior CRB"] = (result["bound"][key], "#222222", "markers")
         for name, (values, colour, mode) in lines.items():
-            shown.add_trace(
-                go.Scatter(
-                    x=steps,
-                    y=values,
-                    name=name,
-                    legendgroup=name,
-                    showlegend=k == 0,
-                    mode=mode,
-                    marker={"color": colour, "size": 5},
-                    line={
-                        "color": colour,
-                        "width": 2,
-                        "dash": "dash" if name == "KF-ortho" else "solid",
-                    },
-                ),
+            dash = "dash" if name == "KF-ortho" else "solid"
+            shown.add_scatter(
+                x=steps,
+                y=values,
+                name=name,
+                legendgroup=name,
+                showlegend=k == 0,
+                mode=mode,
+                marker={"color": colour, "size": 5},
+                line={"color": colour, "width": 2, "dash": dash},
                 row=row + 1,
                 col=column + 1,
             )
