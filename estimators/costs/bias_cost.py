@@ -60,7 +60,7 @@ class AugmentedState(NamedTuple):
 
 def extended(state: AugmentedState, *blocks: FloatArray) -> AugmentedState:
     """Return the state with further extra states of zero; a covariance (n, n) for each block."""
-    more, n = block_diag(*blocks), state.covariance.shape[-1]
+    more, n = np.asarray(block_diag(*blocks)), state.covariance.shape[-1]
     batch, total = state.extra.shape[:-1], n + len(more)
     P = np.zeros((*batch, total, total))
     P[..., :n, :n], P[..., n:, n:] = state.covariance, more

@@ -135,7 +135,7 @@ class PlacePage:
     @in_order("body")
     def drag_body(self, _: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
         """Move the body on the slice to the point under the pointer. Arguments as in `drag`."""
-        axis, (low, _) = 3 - self.state.slice.up, state.plane(self.state)
+        low, axis = state.plane(self.state)[0], 3 - self.state.slice.up
         place = on_plane(camera, point, axis, low[axis])
         self.state = state.place_body(self.state, place)
         self.figures = self.figures._replace(body=body_figures(self.state))
