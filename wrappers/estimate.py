@@ -252,7 +252,9 @@ def scene_filter(scene: Scene, name: str, options: Mapping[str, Any], noise: Any
         **{**scene.links.options, **_inertial_options(name, scene), **options},
     )
     if scene.weakens:
-        check_takes_noise(name, filter, "the scene's obstacles give every epoch its own noise")
+        check_takes_noise(
+            name, filter, "the scene's obstacles change the noise from epoch to epoch"
+        )
     if reads(filter) == "inertial" and scene.inertial is None:
         raise ValueError(
             f"filter {name!r} reads an inertial sensor, scene {scene.name!r} has none: give it "
