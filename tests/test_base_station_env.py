@@ -236,7 +236,7 @@ def test_filters_run_in_drawn_worlds(mode, observation):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must not be given beside scenes"),
+        ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must be left out with scenes"),
         ({"scenes": ["hall"]}, r"scenes\[0\] must be a dict of changes, got 'hall'"),
         ({"scenes": []}, "scenes must hold at least one scene"),
         (

@@ -297,7 +297,7 @@ def test_frames_are_those_of_the_drawn_scene():
 
 
 def test_scene_beside_scenes_is_refused():
-    with pytest.raises(ValueError, match="scene must not be given beside scenes, got 'hall'"):
+    with pytest.raises(ValueError, match="scene must be left out with scenes, got 'hall'"):
         gym.make(ID, scene="hall", scenes=MIXED)
 
 

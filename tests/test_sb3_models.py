@@ -137,7 +137,9 @@ def test_observations_through_vec_normalize_are_scaled_in_the_file(tmp_path):
     again = policy_of(loaded, normalize=envs)
     np.testing.assert_allclose(again(observations), wanted, atol=1e-5)
     other = VecNormalize(Sb3VecEnv(vector("selection", 2)))
-    with pytest.raises(ValueError, match=r"normalize must be of observations \(\d+,\), got"):
+    with pytest.raises(
+        ValueError, match=r"normalize must have observations of shape \(\d+,\), got"
+    ):
         policy_of(loaded, normalize=other)
 
 

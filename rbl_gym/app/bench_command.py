@@ -36,7 +36,7 @@ def add_bench(commands: Any) -> None:
         type=names,
         metavar="A,B",
         help=f"{FILTER_HELP}; default: all except iekf-bank, iekf-bias, iekf-cv, iekf-imu and "
-        "iekf-log, with iekf/robust=true and the filters made for one scene",
+        "iekf-log; plus iekf/robust=true, and for each scene the filters made for it",
     )
     bench.add_argument(
         "--scenes",

@@ -311,7 +311,7 @@ def worlds_of(scene: Any, family: Any) -> tuple[SceneFamily | None, Scene]:
     if family is None:
         return None, scenes.get(scene)
     if scene != "uwb_room":
-        raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
+        raise ValueError(f"scene must be left out with scenes, got {scene!r:.80}")
     found = families.family(family)
     return found, found.corners[0]
 

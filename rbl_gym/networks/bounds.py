@@ -264,7 +264,7 @@ def frame_covariance(
             / check_number("range_std_m", range_std_m, low=1e-12)
         )
     elif known_pair is None:
-        raise ValueError("known_pair must be given where there are no ranges, got None")
+        raise ValueError("known_pair must be given without ranges, got None")
     free = free_columns(len(positions))
     J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
     if known_pair is not None:

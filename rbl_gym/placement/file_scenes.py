@@ -38,7 +38,7 @@ def scene_of_file(path: str) -> Scene:
     """
     file = Path(path)
     if not file.is_file():
-        raise ValueError(f"scene must be a name or a file, there is no file {path!r}")
+        raise ValueError(f"scene must be a name or a file, but there is no file {path!r}")
     return _read(path, file.stat().st_mtime_ns)
 
 

@@ -108,7 +108,7 @@ def _try_all(
 ) -> None:
     unknown = [name for name in skip if name not in checks]
     if unknown:
-        raise ValueError(f"skip must be of {', '.join(checks)}, got {unknown[0]!r}")
+        raise ValueError(f"skip must be names of checks, {', '.join(checks)}; got {unknown[0]!r}")
     for name, check in checks.items():
         if name not in skip:
             check(subject, np.random.default_rng(seed))

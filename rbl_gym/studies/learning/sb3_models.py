@@ -157,7 +157,8 @@ def _scaling(model: Any, normalize: Any) -> Scaling | None:
     mean, variance = normalize.obs_rms.mean, normalize.obs_rms.var
     if mean.shape != model.observation_space.shape:
         raise ValueError(
-            f"normalize must be of observations {model.observation_space.shape}, got {mean.shape}"
+            f"normalize must have observations of shape {model.observation_space.shape}, got "
+            f"{mean.shape}"
         )
     scale = np.sqrt(variance + normalize.epsilon)
     return Scaling(mean.astype(float), scale, float(normalize.clip_obs))
