@@ -65,7 +65,7 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
             if np.ptp(heights) > 0.1:
                 raise ValueError(
                     f"{label}height_offset_m must be given: the truth has no heights, and the "
-                    f"anchors stand at {heights.min():g} to {heights.max():g} m"
+                    f"anchors are at heights of {heights.min():g} to {heights.max():g} m"
                 )
     times = np.concatenate([run.times for run in runs])
     out = np.zeros(len(times), dtype=bool)
