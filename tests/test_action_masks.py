@@ -1,4 +1,4 @@
-"""`action_masks()`: what may be chosen, as sb3-contrib's MaskablePPO asks for it."""
+"""Action masks of `action_masks()`, as MaskablePPO of sb3-contrib uses them."""
 
 from __future__ import annotations
 

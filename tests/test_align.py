@@ -1,4 +1,4 @@
-"""Alignment of tracks: against scipy's solution, and what positions cannot tell."""
+"""Alignment of tracks: against scipy's solution, and undetermined cases."""
 
 from __future__ import annotations
 

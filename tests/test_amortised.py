@@ -1,4 +1,4 @@
-"""The network that places anchors: against torch, units, padding, legality, how good it is."""
+"""The network that places anchors: against torch, units, padding, legality, quality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The house: who may import whom, what an import costs, what stands where."""
+"""The architecture: allowed imports, their cost, and the contents of the folders."""
 
 from __future__ import annotations
 

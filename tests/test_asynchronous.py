@@ -1,4 +1,4 @@
-"""Ranges one at a time: order, window, and what their own times are worth."""
+"""Ranges one at a time: order, window, and the gain from their own time stamps."""
 
 from __future__ import annotations
 

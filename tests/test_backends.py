@@ -1,4 +1,4 @@
-"""Sweeps on several workers: the bytes of one process, whoever dies on the way."""
+"""Sweeps on several workers: the same bytes as in one process, even if workers die."""
 
 from __future__ import annotations
 

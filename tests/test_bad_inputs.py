@@ -1,4 +1,4 @@
-"""What comes in wrong gives a ValueError that says what and where; for every filter alike."""
+"""Bad input gives a ValueError that names the argument and the value, for every filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 and MCAP, written here by rosbags, as the files of a recording."""
+"""ROS 1 and ROS 2 bags and MCAP files, written here by rosbags, as files of a recording."""
 
 from __future__ import annotations
 

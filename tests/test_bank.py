@@ -1,4 +1,4 @@
-"""The bank of iterated EKFs: it starts from nothing, follows mirror poses, comes back when lost."""
+"""The bank of iterated EKFs: unknown start, mirror poses, recovery of a lost track."""
 
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations

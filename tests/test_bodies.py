@@ -1,4 +1,4 @@
-"""Tag layouts: the shapes their names promise, centred, and bad sizes refused."""
+"""Tag layouts: named shapes, centred tags, errors for bad sizes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Buildings from files: walls, mounts, zones, the schema, and what is refused."""
+"""Building files: walls, mounts, zones, the schema, and errors."""
 
 from __future__ import annotations
 

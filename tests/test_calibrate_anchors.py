@@ -1,4 +1,4 @@
-"""Anchors surveyed without truth: known answers, honest covariances, starts from nothing, files."""
+"""Survey of anchors without truth: known answers, consistent covariances, unknown starts, files."""
 
 from __future__ import annotations
 

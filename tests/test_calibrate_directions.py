@@ -1,4 +1,4 @@
-"""Bias and deviation by direction, and how a gyroscope sits: known answers, real agents."""
+"""Bias and deviation by direction, and the axes of a gyroscope: known answers, real agents."""
 
 from __future__ import annotations
 

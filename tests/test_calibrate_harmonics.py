@@ -1,4 +1,4 @@
-"""Bias by the direction of the ray found in a log with truth: known patterns, none, the command."""
+"""Bias by the direction of the ray from a log with truth: known patterns, no bias, the command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Links, tags and clocks calibrated by truth: known answers, honest standard deviations, files."""
+"""Calibration of links, tags and clocks with truth: known answers, standard deviations, files."""
 
 from __future__ import annotations
 

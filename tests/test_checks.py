@@ -1,4 +1,4 @@
-"""Arguments: good ones come back as float64 unchanged, bad ones are named with what is wrong."""
+"""Checks of arguments: valid ones are returned as float64, errors name invalid ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Offsets that last: a filter of the pose and of clocks that drift, against naive forms."""
+"""Persistent clock offsets: a filter of the pose and of drifting clocks, against naive forms."""
 
 from __future__ import annotations
 

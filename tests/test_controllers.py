@@ -1,4 +1,4 @@
-"""Reference controllers: legal, where they say they go, and better in the order they should be."""
+"""Reference controllers: legal actions, the documented behaviour, and their order of quality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A filter that contradicts its data: said, with the fault that was put in; honest logs: not."""
+"""Diagnosis of a filter that does not fit its data: inserted faults are named, good logs pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of time differences and of pseudo-ranges: read, refused, replayed."""
+"""Logs of time differences and pseudo-ranges: reading, errors, replay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages: their Python runs as it stands, their commands are commands, all can be reached."""
+"""The pages: their Python blocks run, their commands exist, all pages can be reached."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two engines of the KF family against each other, and which of them runs when."""
+"""Both engines of the KF family against each other, and the choice between them."""
 
 from __future__ import annotations
 

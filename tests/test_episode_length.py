@@ -1,4 +1,4 @@
-"""What every id promises by its spec: the length of its episodes, as made; and options of reset."""
+"""Episode lengths of all ids as in their specs; options of reset."""
 
 from typing import Any
 

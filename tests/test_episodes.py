@@ -1,4 +1,4 @@
-"""The store of running episodes: what a step reads equals what each world's generator made."""
+"""The store of running episodes: a step reads the values drawn by the generator of each world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The law of an epoch is an argument of the update, whoever wrote the filter."""
+"""The noise law of an epoch as an argument of the update, also for filters of others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""EstimatePose against the filter driven by hand; its consistency, its specs, its refusals."""
+"""EstimatePose against a filter driven by hand; its consistency, specs and errors."""
 
 from __future__ import annotations
 

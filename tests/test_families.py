@@ -1,4 +1,4 @@
-"""Families of scenes: what is drawn, and environments that draw a world at every reset."""
+"""Families of scenes: the draws, and environments that draw a world at every reset."""
 
 from __future__ import annotations
 

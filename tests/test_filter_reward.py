@@ -1,4 +1,4 @@
-"""AnchorPlacement paid by a filter: the reward by a plain loop, what is refused, the contract."""
+"""AnchorPlacement with a filter as reward: against a plain loop, errors, the contract."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The clock of an inertial sensor by ranges: known offsets, honest refusals."""
+"""The clock offset of an inertial sensor from ranges: known offsets, errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter that an inertial sensor carries: against a textbook EKF, and honest in simulation."""
+"""The filter driven by an inertial sensor: against a textbook EKF, consistency in simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Innovations of an update: against the textbook at the prior, the likelihood, what is refused."""
+"""Innovations of an update: against the textbook form at the prior, likelihood, rejected ranges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a replayed track is judged by: truth of positions, in another clock or frame, with holes."""
+"""Comparison of a replayed track with truth: positions only, other clocks and frames, gaps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The common ground of the kernels: dispatch, cache, small matrices, rotations."""
+"""Common parts of the kernels: dispatch, cache, small matrices, rotations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layouts for those who mount them: the list, CSV, GeoJSON, DXF."""
+"""Export of layouts: mounting list, CSV, GeoJSON, DXF."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layouts of anchors from CSV files, and what is refused."""
+"""Layouts of anchors from CSV files, and errors in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Searches on the score: against brute force, never worse than where they came from."""
+"""Searches on the score: against brute force, never worse than their start."""
 
 from __future__ import annotations
 

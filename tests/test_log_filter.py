@@ -1,4 +1,4 @@
-"""The filter for logs, ranges that err late, soft knowledge of height and tilt: consistency."""
+"""The filter for logs: late ranges, soft knowledge of height and tilt, consistency."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error messages are in plain words: they name what is wrong, what came and what to do."""
+"""Error messages are in plain words."""
 
 import ast
 import re

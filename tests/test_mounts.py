@@ -1,4 +1,4 @@
-"""Where anchors may stand in a building: draws, projections, faces, and what is cut out."""
+"""Possible positions of anchors in a building: draws, projections, faces, forbidden parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HTML pages: what they hold, and that a browser opens them without an error."""
+"""HTML pages: their contents, and that a browser opens them without an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `place` answers: verdicts of zones, least numbers, what anchors are for, given layouts."""
+"""Answers of `place`: verdicts of zones, least numbers, contributions of anchors, given layouts."""
 
 from __future__ import annotations
 

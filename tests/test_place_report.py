@@ -1,4 +1,4 @@
-"""The report of a placement: from somebody's plan to PDF, page and picture in one command."""
+"""The report of a placement: from a plan to PDF, page and picture in one command."""
 
 from __future__ import annotations
 

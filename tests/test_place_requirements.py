@@ -1,4 +1,4 @@
-"""What a zone asks for, and layouts chosen from candidates: held to plain loops and all choices."""
+"""Requirements of zones, and layouts chosen from candidates: against plain loops, all choices."""
 
 from __future__ import annotations
 

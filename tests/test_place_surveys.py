@@ -1,4 +1,4 @@
-"""What a better survey, or calibrated links, would buy a layout."""
+"""The gain of a layout from a better survey or calibrated links."""
 
 from __future__ import annotations
 

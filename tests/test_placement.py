@@ -1,4 +1,4 @@
-"""Placement problems: contexts and scores against textbook loops, and what scores must obey."""
+"""Placement problems: contexts and scores against textbook loops, and properties of scores."""
 
 from __future__ import annotations
 

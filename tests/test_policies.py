@@ -1,4 +1,4 @@
-"""Policies in numpy: by hand, through their files, and files that are none."""
+"""Policies in numpy: by hand, through their files, and invalid files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What importing and drawing leave behind in the process: nothing."""
+"""Importing and drawing change nothing in the process."""
 
 import matplotlib
 import pytest

@@ -1,4 +1,4 @@
-"""The range model: sampled noise has the variance the laws state, links fail as often as said."""
+"""The range model: sampled noise has the stated variance, links fail at the stated rate."""
 
 from __future__ import annotations
 

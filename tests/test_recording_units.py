@@ -1,4 +1,4 @@
-"""Units of a recording: what cannot be in one unit is refused, what can is read."""
+"""Units of a recording: impossible units raise ValueError, possible ones are read."""
 
 from __future__ import annotations
 

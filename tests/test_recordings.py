@@ -1,4 +1,4 @@
-"""Recordings: what the files say is what the arrays hold, and what is wrong in them is named."""
+"""Recordings: the arrays have the values of the files, and errors name file, line and column."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refusals of the world's functions that no other test meets, each by its message."""
+"""Errors of functions that no other test covers, each by its message."""
 
 # pyright: reportArgumentType=false
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Frames: what they show, that they are the same for the same episode, and how fast they come."""
+"""Frames: their contents, reproducibility and speed."""
 
 from __future__ import annotations
 

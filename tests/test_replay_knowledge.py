@@ -1,4 +1,4 @@
-"""Replay of bodies with one tag or two, a start, soft knowledge; what is not determined is said."""
+"""Replay of bodies with one or two tags, a start, soft knowledge; notes on unknown directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mirror poses of recordings: named where the ranges leave them, ruled out where they do not."""
+"""Mirror poses of recordings: reported if the ranges allow them, else excluded."""
 
 from __future__ import annotations
 

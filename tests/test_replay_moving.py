@@ -1,4 +1,4 @@
-"""Recordings whose anchors move: replayed as those whose anchors stand."""
+"""Recordings with moving anchors: the same replay as with fixed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truth beside a track: what is compared, what is said where little or nothing is, and hints."""
+"""Truth and track: what is compared, notes if there is little truth, and hints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robust update: wrong links have no pull, right ones keep theirs."""
+"""The robust update: wrong links have no influence, right ones keep theirs."""
 
 from __future__ import annotations
 

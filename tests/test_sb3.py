@@ -1,4 +1,4 @@
-"""The adapter to stable-baselines3, and the training that stands on it."""
+"""The adapter to stable-baselines3, and the training that uses it."""
 
 # The package may be absent.
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false

@@ -1,4 +1,4 @@
-"""Models of stable-baselines3 as policy files: the same actions, and models that are refused."""
+"""Models of stable-baselines3 as policy files: the same actions, and unsupported models."""
 
 # The packages may be absent.
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false

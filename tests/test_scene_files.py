@@ -1,4 +1,4 @@
-"""Placement problems from files and named scenes: what is read, and every refusal."""
+"""Placement problems from files and named scenes: values read, and all errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes: the figures of the design's table, overrides from plain dicts, and what they refuse."""
+"""Scenes: the values of the table in the design, overrides from plain dicts, and errors."""
 
 from __future__ import annotations
 

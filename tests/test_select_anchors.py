@@ -1,4 +1,4 @@
-"""SelectAnchors below EstimatePose: what the chosen anchors measure, and nothing else."""
+"""SelectAnchors below EstimatePose: only the chosen anchors measure."""
 
 from __future__ import annotations
 

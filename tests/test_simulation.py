@@ -1,4 +1,4 @@
-"""Episodes against naive loops, the stated laws of the draws, and arithmetic done by hand."""
+"""Episodes against naive loops, the stated laws of the draws, and computations by hand."""
 
 from __future__ import annotations
 

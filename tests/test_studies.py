@@ -1,4 +1,4 @@
-"""What the commands compute, as functions: the same figures, from Python."""
+"""The commands as functions: the same results from Python."""
 
 from __future__ import annotations
 

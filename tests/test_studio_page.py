@@ -1,4 +1,4 @@
-"""The page of the studio, served by viser; and in a browser, where there is one."""
+"""The page of the studio, served by viser; and in a browser, if there is one."""
 
 from __future__ import annotations
 

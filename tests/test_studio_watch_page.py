@@ -1,4 +1,4 @@
-"""The page on which filters are watched, served by viser; and in a browser, where there is one."""
+"""The page for watching filters, served by viser; and in a browser, if there is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables and progress with rich and without it."""
+"""Tables and progress, with and without rich."""
 
 from __future__ import annotations
 

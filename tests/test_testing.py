@@ -1,4 +1,4 @@
-"""The conformance kit: our own estimators pass, broken ones fail by the check that is theirs."""
+"""The conformance tests: our own estimators pass, broken ones fail the expected check."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Offsets of clocks, by signals and by motion: right, and as certain as they say."""
+"""Clock offsets from signals and from motion: values and standard deviations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of tracks: what is written is what is read, and what other programs expect."""
+"""Files of tracks: reading what was written, and the formats of other programs."""
 
 from __future__ import annotations
 

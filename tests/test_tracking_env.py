@@ -1,4 +1,4 @@
-"""RBL/Tracking-v0: Gymnasium's contract, the score by hand, and what it refuses."""
+"""RBL/Tracking-v0: Gymnasium's contract, the score by hand, and errors."""
 
 from __future__ import annotations
 

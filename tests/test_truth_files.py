@@ -1,4 +1,4 @@
-"""Files of reference poses: what others write is read as it is meant, or refused by name."""
+"""Files of reference poses: formats of other programs, and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings by the likelihood of a log's first part."""
+"""Tuning of settings by the likelihood of the first part of a log."""
 
 from __future__ import annotations
 

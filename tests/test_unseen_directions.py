@@ -1,4 +1,4 @@
-"""What nothing determines stays wide: tags in a line, tags that never range, lost tracks."""
+"""Undetermined directions stay wide: tags in a line, tags without ranges, lost tracks."""
 
 from __future__ import annotations
 

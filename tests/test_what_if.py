@@ -1,4 +1,4 @@
-"""Bounds by what tells the motion and what is not known: the command, and its function."""
+"""Bounds by motion model and unknowns: the command, and its function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/your_estimator.md: its blocks run as they stand, and its filter enters the leaderboard."""
+"""docs/your_estimator.md: its blocks run, and its filter enters the leaderboard."""
 
 from __future__ import annotations
 
