@@ -98,7 +98,7 @@ def test_options_that_nobody_knows_are_refused(name):
     env, envs = gym.make(id_of(name)), gym.make_vec(id_of(name), num_envs=2)
     for made in (env, envs):
         made.reset(seed=0, options={})
-        with pytest.raises(ValueError, match="options m.*got 'nonsense'"):
+        with pytest.raises(ValueError, match=r"options m.*got 'nonsense'"):
             made.reset(seed=0, options={"nonsense": 1})
         with pytest.raises(ValueError, match="options must be a dict or None, got 3"):
             made.reset(seed=0, options=3)  # pyright: ignore[reportArgumentType]
