@@ -487,7 +487,7 @@ def test_the_selection_shows_the_drawn_hall_and_what_was_learned():
     ("name", "arguments", "named"),
     [
         ("MobileAnchors", {"scenes": [STILL]}, "scene must have moving anchors"),
-        ("MobileAnchors", {"scenes": CRAFT, "scene": "hall"}, "scene must not be given beside"),
+        ("MobileAnchors", {"scenes": CRAFT, "scene": "hall"}, "scene must be left out with scenes"),
         ("AnchorSelection", {"scenes": HALLS, "k": 8}, "k must be .* 7, got 8"),
     ],
 )
