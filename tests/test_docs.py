@@ -20,6 +20,7 @@ from rbl_gym.placement import design
 from rbl_gym.studies.learning import policies
 from rbl_gym.studies.learning.deep_sets import DeepSets
 from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
+from rbl_gym.studies.placing import accuracy
 from rbl_gym.studies.replay import causes
 from tests.helpers import ROOT, needs
 
@@ -83,6 +84,7 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
         ]
         test_bags.write_bag(tmp_path / "flight", "ros1", types, messages)
     monkeypatch.setattr(design, "STAGES", (64, 64, 64))  # pages show how, not how well
+    monkeypatch.setattr(accuracy, "_MAP", 12)
     monkeypatch.setattr(causes, "_RANGES", 500)
     monkeypatch.setattr(causes, "_FEWEST", 20)
     write_files_that_pages_read(tmp_path)

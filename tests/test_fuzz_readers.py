@@ -15,7 +15,7 @@ from rbl_gym.recordings import Format, read_recording
 from tests import fuzz_files
 from tests.fuzz_files import READERS, check
 
-MUTANTS = 150  # of each good file; docs/fuzzing.md says for how many it was run
+MUTANTS = 75  # of each good file; docs/fuzzing.md says for how many it was run
 
 NAMES = list(READERS)
 

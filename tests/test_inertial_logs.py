@@ -73,7 +73,11 @@ def tracked(column, yaw_off_rad, headings):
 @pytest.mark.skipif(not STARLOC.is_dir(), reason="the STAR-loc recording is not on this machine")
 @pytest.mark.parametrize(
     ("column", "yaw_off_rad", "headings"),
-    [("range_calib", 0.4, 1), ("range", -0.4, 1), ("range", 2.5, 12)],
+    [
+        ("range_calib", 0.4, 1),
+        ("range", -0.4, 1),
+        pytest.param("range", 2.5, 12, marks=pytest.mark.long),
+    ],
 )
 def test_a_rig_with_two_tags_is_tracked(column, yaw_off_rad, headings):
     """Raw ranges carry a common bias of 0.2 m; ranges alone give the axis of the tags only."""
