@@ -74,7 +74,9 @@ def context_of(info) -> Context:
 # --- Gymnasium --------------------------------------------------------------------------------
 
 
-@every_world
+# Every mode, with racks and without, with sight and without, few anchors.
+@pytest.mark.parametrize("kind", ["satellite", "one rack, one anchor", "own scene", "at once, auv",
+                                  "sight at once", "mounts and racks"])  # fmt: skip
 def test_gymnasiums_checker_has_no_complaint(kind):
     check_env(gym.make(ID, **WORLDS[kind]).unwrapped)
 
