@@ -417,7 +417,7 @@ def test_transfer_of_a_loop_by_hand():
     policy = random_policy("box", (size, 4, 6), seed=2)
     told: list[int] = []
     found = transfer.transfer_task(
-        task, {"mine": policy}, ["orbit"], 4, 1, 5, lambda n=1, more=0: told.append(n)
+        task, {"mine": policy}, ["orbit"], 4, 1, 5, lambda steps=1, *, more=0: told.append(steps)
     )
     assert list(found["filters"]) == ["iekf", "iekf-bank", "iekf, reflections"]
     assert sum(told) == 6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -111,9 +112,9 @@ def test_many_worlds_are_each_the_scalar_environment(lengths):
 
 def test_the_checker_and_frames():
     check_env(gym.make(ID, scenes=DRAWN).unwrapped, skip_render_check=True)
-    env = gym.make(ID, scenes=DRAWN, render_mode="rgb_array")
+    env: Any = gym.make(ID, scenes=DRAWN, render_mode="rgb_array")
     env.reset(seed=1)
-    assert env.render().shape == (540, 960, 3)  # pyright: ignore[reportAttributeAccessIssue]
+    assert env.render().shape == (540, 960, 3)
 
 
 def test_largest_numbers_are_those_of_the_spaces():
@@ -121,7 +122,8 @@ def test_largest_numbers_are_those_of_the_spaces():
     assert (family.highest.n_nodes, family.highest.radius_m, family.highest.side_m) == (7, 8, 30)
     assert laws.limits({"choice": [3.0, {"uniform": [1.0, 9.0]}, 2]}) == (1.0, 9.0)
     assert laws.limits(4) == (4, 4)
-    assert gym.make(ID, scenes=DRAWN).observation_space["bearings"].shape == (7, 7)  # pyright: ignore
+    space: Any = gym.make(ID, scenes=DRAWN).observation_space
+    assert space["bearings"].shape == (7, 7)
 
 
 @pytest.mark.parametrize(

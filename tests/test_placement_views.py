@@ -153,7 +153,7 @@ def test_the_vector_environment_shows_the_same(kind, view):
 
 def test_views_by_path_and_with_a_space_of_their_own():
     path = "tests.test_placement_views:distances"
-    env = gym.make(ID, observation=path)
+    env: Any = gym.make(ID, observation=path)
     assert env.spec is not None
     again = gym.make(pickle.loads(pickle.dumps(env.spec)))
     seen = again.reset(seed=1)[0]

@@ -66,7 +66,7 @@ def assert_same_actions(got, wanted, kind):
 def test_the_file_plays_the_models_actions(kind, form, changes, tmp_path):
     model = model_of(kind, form, **changes)
     policies.save(policy_of(model, kind), tmp_path / "p.npz")
-    policy = policies.load(tmp_path / "p.npz")
+    policy: Any = policies.load(tmp_path / "p.npz")
     assert policy.meta == {"task": kind, "algorithm": form.__name__.lower(), "steps": 0}
     envs = vector(kind, 64)
     observations, _ = envs.reset(seed=1)
@@ -110,7 +110,7 @@ def test_a_memory_is_kept(tmp_path):
     lstm = {"lstm_hidden_size": 8, "net_arch": [12]}
     model = model_of("mobile", RecurrentPPO, policy_kwargs=lstm)
     policies.save(policy_of(model), tmp_path / "p.npz")
-    policy = policies.load(tmp_path / "p.npz")
+    policy: Any = policies.load(tmp_path / "p.npz")
     assert policy.meta["algorithm"] == "recurrent-ppo"
     play, envs, state = policy.player(), vector("mobile", 16), None
     observations, _ = envs.reset(seed=1)
@@ -124,7 +124,7 @@ def test_observations_through_vec_normalize_are_scaled_in_the_file(tmp_path):
     envs = VecNormalize(Sb3VecEnv(vector("mobile", 8)), clip_obs=1.5)
     model = spread(PPO("MlpPolicy", envs, batch_size=64, **SMALL).learn(200))
     policies.save(policy_of(model), tmp_path / "p.npz")
-    policy = policies.load(tmp_path / "p.npz")
+    policy: Any = policies.load(tmp_path / "p.npz")
     observations, _ = vector("mobile", 256).reset(seed=1)
     scaled = envs.normalize_obs(observations)
     assert (np.abs(scaled) == 1.5).any()
@@ -143,7 +143,7 @@ def test_observations_through_vec_normalize_are_scaled_in_the_file(tmp_path):
         policy_of(loaded, normalize=other)
 
 
-def small(observation=None, action=None, form=PPO, policy="MlpPolicy", **changes):
+def small(observation=None, action=None, form=PPO, policy: Any = "MlpPolicy", **changes):
     """A model on an environment of these spaces, which does nothing."""
     unit = gym.spaces.Box(-1, 1, (3,))
 

@@ -40,7 +40,9 @@ def edge_variance(n_edges: int, n_nodes: int, bearing_std_rad: float) -> float:
     return 2 * bearing_std_rad**2 * (n_nodes - 1) / n_edges
 
 
-def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: float) -> FloatArray:
+def linked_covariance(
+    links: BoolArray, bearing_std_rad: float | FloatArray, prior_std_rad: float
+) -> FloatArray:
     """Return the orientation bound (..., n - 1, n - 1) of networks that may be disconnected.
 
     Nodes without a path to node 0 keep their prior: their links give no information on node 0.
@@ -50,7 +52,7 @@ def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: f
     links
         (..., n, n) symmetric: the pairs that see each other.
     bearing_std_rad
-        sigma of a bearing.
+        sigma of a bearing; (..., 1, 1) for several networks.
     prior_std_rad
         Prior standard deviation of an orientation without measurements; it keeps the bound finite.
     """

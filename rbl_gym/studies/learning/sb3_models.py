@@ -54,7 +54,7 @@ def policy_of(model: Any, task: str | None = None, *, normalize: Any = None) -> 
         policy class, features extractor or network; another activation; ``squash_output=True``;
         more than one LSTM layer. Also if `normalize` has another shape.
     """
-    network = getattr(model, "policy", None)
+    network: Any = getattr(model, "policy", None)
     for part in ("action_net", "mlp_extractor", "features_extractor"):
         if not hasattr(network, part):
             raise ValueError(
