@@ -184,7 +184,9 @@ def test_information(law, batch, common, m, n):
         pytest.skip("no such tag")
     world = World(batch, m, n, common)
     for share in (world.share, np.ones((m, n)), np.zeros((m, n), bool)):
-        assert_equal_forms(information.link_information, np.eye(6), *world.places, law.numbers, share)
+        assert_equal_forms(
+            information.link_information, np.eye(6), *world.places, law.numbers, share
+        )
 
 
 def test_a_law_that_no_kernel_knows_takes_the_textbook_form():

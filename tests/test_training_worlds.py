@@ -189,12 +189,12 @@ def test_a_new_policy_for_craft_is_the_orbit():
 @needs("torch", "stable_baselines3", "sb3_contrib")
 def test_files_play_what_the_model_would(task, algorithm):
     """The deterministic actions of stable-baselines3 itself, along an episode."""
-    from rbl_gym.studies.learning import training
+    from rbl_gym.studies.learning import sb3_models, training
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
     envs = Sb3VecEnv(task.make(3))
     model = training._model(algorithm, task, envs, 0)
-    policy = training._policy(model, {"algorithm": algorithm})
+    policy = sb3_models.policy_of(model)
     env = task.make(3, "Disabled")
     (seen, _), state, play = env.reset(seed=5), None, policy.player()
     for step in range(3):

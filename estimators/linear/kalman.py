@@ -251,7 +251,7 @@ class KalmanFamily:
             weights = weigh_plain(state.covariance, ranges, law, anchors, VAGUE_ENTRY_VARIANCE)
             if not (all_finite(weights) and all_finite(anchors)):
                 return None
-            epoch = LinearEpoch(ranges, anchors, self.tags, weights)
+            epoch = LinearEpoch(np.asarray(ranges), np.asarray(anchors), self.tags, weights)
             mean, covariance = FilterPy.update(*plain(state)[:2], epoch)
         return KalmanState(mean, covariance, np.zeros(batch, bool))
 
