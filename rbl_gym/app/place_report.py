@@ -87,7 +87,8 @@ def notes(result: dict[str, Any]) -> list[str]:
         f"Check: {check['trials']} bodies at random poses, as many in each zone; the EKF starts "
         f"from a prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m "
         "around the truth. RMSE, ratio and NEES (6 if consistent) are of all bodies that have a "
-        "pose; found: the error is not larger than expected once in a million.",
+        "pose; found: share of bodies with an error below the limit that a consistent filter "
+        "exceeds once in a million.",
     ]
     for name, figures in check["filters"].items():
         if 1 - figures["found"] > _MANY_LOST:

@@ -48,7 +48,7 @@ def survey_rows(
     """
     cases: list[tuple[str, float, LinkBias | None]] = [("anchors and links", 0.0, None)]
     cases += [(f"anchors to {100 * std:g} cm", std, None) for std in SURVEYS_M]
-    cases += [("anchors, not the links", 0.0, UNCALIBRATED)]
+    cases += [("anchors, but not the links", 0.0, UNCALIBRATED)]
     rows = []
     for name, std, bias in cases:
         found = [
