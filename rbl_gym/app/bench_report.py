@@ -71,7 +71,7 @@ def _nominal(scene: str, first: dict[str, Any], by_filter: dict[str, dict[str, A
     for name, rows in order:
         if name not in ran:
             row = rows["nominal"]
-            table.add_row(name, f"{row['status']}, {_rank(row)}", style="dim")
+            table.add_row(name, f"{row['status']}, see below", style="dim")
     if bounds:
         table.add_row(
             "bound", *(column[-1] for column in columns[:3]), "", "", "1.000", style="bold"
@@ -121,8 +121,8 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
     lines = []
     if first["status"] == "unobservable":
         lines.append(
-            f"{name}: does not determine the pose in this scene, {_rank(first)}: it depends on "
-            "its prior"
+            f"{name}: does not determine the pose in this scene, rank {first['rank']} of "
+            f"{first['states']}: it depends on its prior"
         )
     for condition, row in conditions.items():
         if row["message"]:
@@ -140,10 +140,6 @@ def _tags(conditions: dict[str, Any], condition: str) -> float:
     """Return the sort key of a filter: its tag RMSE, infinite without one."""
     value = conditions.get(condition, {}).get("tags_m", {}).get("rmse")
     return float("inf") if value is None else value
-
-
-def _rank(row: dict[str, Any]) -> str:
-    return "" if row["rank"] is None else f"rank {row['rank']} of {row['states']}"
 
 
 def _anees(rows: list[dict[str, Any]]) -> list[str]:

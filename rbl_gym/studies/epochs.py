@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -153,6 +153,11 @@ def timed(steps: Iterable[Step]) -> Iterator[tuple[Step, float]]:
         except StopIteration:
             return
         yield step, time.process_time() - start
+
+
+def seconds_per_step(taken: Sequence[float]) -> float:
+    """Return the mean of the times of `timed`, without the first, which also loads kernels."""
+    return float(np.mean(taken[1:] or taken))
 
 
 def stack_beliefs(beliefs: Iterable[PoseBelief]) -> PoseBelief:

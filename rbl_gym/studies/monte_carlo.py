@@ -12,7 +12,15 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.linear.kalman import KalmanState
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.noise_laws import WeakenedNoise
-from rbl_gym.studies.epochs import Reading, Step, pose_errors, stack_beliefs, timed, track_epochs
+from rbl_gym.studies.epochs import (
+    Reading,
+    Step,
+    pose_errors,
+    seconds_per_step,
+    stack_beliefs,
+    timed,
+    track_epochs,
+)
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import scene_filter
@@ -191,10 +199,10 @@ def track_trials(
         Called after every epoch.
     """
     episode, tags = trials.episode, np.asarray(trials.scene.tags)
-    beliefs, rows, seconds = [], [], 0.0
+    beliefs, rows, times = [], [], []
     filter = scene_filter(trials.scene, name, options)
     for step, taken in timed(trial_steps(trials, filter)):
-        seconds += taken
+        times.append(taken)
         beliefs.append(step.belief)
         none = np.zeros(step.belief.translation.shape[:-1])
         rows.append((*_own_variances(step.state), getattr(step.state, "constrained", none)))
@@ -214,7 +222,7 @@ def track_trials(
         own_rotation,
         own_translation,
         constrained,
-        seconds / errors.nees.size,
+        seconds_per_step(times) * count / errors.nees.size,
     )
 
 

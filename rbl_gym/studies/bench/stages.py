@@ -13,12 +13,19 @@ from rbl_gym.estimators.linear.squared_range import geometric_rank
 from rbl_gym.studies import monte_carlo, replay
 from rbl_gym.studies.bench import recordings, worlds
 from rbl_gym.studies.bench.figures import BenchErrors, Reference, error_figures, json_number
-from rbl_gym.studies.epochs import Step, pose_errors, stack_beliefs, timed, track_epochs
+from rbl_gym.studies.epochs import (
+    Step,
+    pose_errors,
+    seconds_per_step,
+    stack_beliefs,
+    timed,
+    track_epochs,
+)
 from rbl_gym.worlds import scenes
 
 
 class Tracked(NamedTuple):
-    """The run of a filter: beliefs (K, B, ...), number of triggers, processor time in seconds."""
+    """The run of a filter: beliefs (K, B, ...), number of triggers, processor time of a step."""
 
     belief: estimators.PoseBelief
     trigger_rate: float | None
@@ -131,18 +138,18 @@ def run_filter(
     except StoppedError as stop:
         return result | _stopped(stop), None
     result["trigger_rate"] = json_number(tracked.trigger_rate)
-    steps = tracked.belief.translation[..., 0].size
-    return result | stage.figures(tracked), 1e6 * tracked.seconds / steps
+    trials = tracked.belief.translation[0, ..., 0].size
+    return result | stage.figures(tracked), 1e6 * tracked.seconds / trials
 
 
 def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
     """Return all beliefs of a filter; raise StoppedError if it fails or has no beliefs."""
-    beliefs, triggers, seconds = [], [], 0.0
+    beliefs, triggers, times = [], [], []
     # Overflow of a diverging filter shows in its figures.
     with np.errstate(all="ignore"):
         try:
             for step, taken in timed(steps):
-                seconds += taken
+                times.append(taken)
                 shapes = [np.shape(array) for array in step.belief[:3]]
                 if shapes != [(*batch, *core) for core in ((3, 3), (3,), (6, 6))]:
                     raise TypeError(
@@ -154,7 +161,7 @@ def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
         except Exception as error:
             raise StoppedError(len(beliefs), error) from error
     rate = None if triggers[0] is None else float(np.mean(triggers))
-    return Tracked(stack_beliefs(beliefs), rate, seconds)
+    return Tracked(stack_beliefs(beliefs), rate, seconds_per_step(times))
 
 
 def _stopped(stop: StoppedError) -> dict[str, Any]:
