@@ -18,7 +18,7 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.regions import Box
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import building, scene_files
-from rbl_gym.placement.file_keys import FORMAT
+from rbl_gym.placement.file_keys import FORMAT, MATERIALS
 from rbl_gym.placement.file_schema import schema
 from rbl_gym.placement.file_walls import wall_pieces
 from tests.helpers import ROOT, needs
@@ -164,6 +164,33 @@ def test_losses_by_material_multiply_and_opaque_ones_count_once():
     places = np.array([[x, 4.0, 1.0] for x in (1, 3, 5, 6.5, 7.5, 8.3, 9)])
     share = problem.obstacles.share(np.array([[0.0, 4, 1]]), places)[:, 0]
     np.testing.assert_allclose(share, [1, 0.8, 0.4, 0.004, 0.004, 0.004, 0.0032])
+
+
+def test_standard_materials_need_no_entry_and_an_entry_overrides_them():
+    line = {"line": [[2, 0], [2, 8]], "high_m": 3}
+
+    def share(material, **own):
+        tables = HALL | {"walls": [line | {"material": material}], "materials": own}
+        if not own:
+            del tables["materials"]
+        obstacles = scene_files.of_mapping(tables).obstacles
+        return float(obstacles.share(np.array([[0.0, 4, 1]]), np.array([[3.0, 4, 1]]))[0, 0])
+
+    # The table of docs/building_files.md.
+    text = (ROOT / "docs" / "building_files.md").read_text(encoding="utf-8")
+    section = text.split("### `[materials]`")[1].split("###")[0]
+    names, _, values = (
+        [cell.strip(" `") for cell in row.strip("|").split("|")]
+        for row in section.splitlines()
+        if row.startswith("|")
+    )
+    assert names == list(MATERIALS)
+    for name, value in zip(names, values, strict=True):
+        assert share(name) == pytest.approx(float(value))
+    assert share("brick", curtain=0.9) == pytest.approx(0.15)
+    assert share("brick", brick=0.4) == pytest.approx(0.4)
+    with pytest.raises(ValueError, match=r"has 'curtain', or a standard .*'brick'.*got 'brik'"):
+        share("brik", curtain=0.9)
 
 
 @needs("shapely")
@@ -339,7 +366,7 @@ BAD = [
     ("walls.0.thickness_m", 0, "walls[0].thickness_m must be a finite number in [0.001"),
     ("walls.0.thickness_m", NAN, "walls[0].thickness_m must be a finite number"),
     ("walls.0.closed", 1, "walls[0].closed must be true or false, got 1"),
-    ("walls.1.material", "wood", "walls[1].material must be one of [materials], which has 'dry"),
+    ("walls.1.material", "wool", "walls[1].material must be one of [materials], which has 'dry"),
     ("walls.1.information", 0.5, "walls[1] must have either material or information"),
     ("walls.0.line", [[0, 0], [4, 4], [4, 0], [0, 2]], "walls[0].line must not cross or touch"),
     ("walls.1.line", [[0, 0], [0, 0]], "walls[1].line must have at least 2 different points"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rbl_gym.geometry import polygons
+from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.plans import (
     drawing,
     geojson,
@@ -19,7 +20,7 @@ from rbl_gym.placement.plans import (
     rings,
     toml_text,
 )
-from rbl_gym.placement.plans.uses import KEYS, KINDS, MATERIALS, Use, parse_use
+from rbl_gym.placement.plans.uses import KEYS, KINDS, Use, parse_use
 from tests.helpers import needs
 from tests.plan_files import DESK, INNER, MEETING, OUTER, write_dxf, write_geojson, write_png
 

@@ -96,7 +96,10 @@ _BOX = {
 }
 _SHARE: dict[str, Any] = {"low": 0.0, "high": 1.0}
 _LOSS = {
-    "material": Key("text", "one of [materials]; opaque without material and information"),
+    "material": Key(
+        "text",
+        "one of [materials] or a standard material; opaque without material and information",
+    ),
     "information": Key(
         "number", "share of the information that remains, in place of material", **_SHARE
     ),
@@ -197,6 +200,11 @@ def _noise_form(kind: str, law: Any) -> Form:
     )
 
 
+# Standard materials: share of the information of a link after one crossing, 10^(-loss / 10 dB);
+# rough at 6 GHz.
+MATERIALS = {
+    "drywall": 0.7, "glass": 0.6, "wood": 0.5, "brick": 0.15, "concrete": 0.05, "metal": 0.0,
+}  # fmt: skip
 MATERIALS_DOC = "share of a link's information that remains after one crossing, by name"
 FORMAT: dict[str, Table] = {
     "anchors": Table(

@@ -11,6 +11,7 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.geometry.polygons import TOUCH_M, check_polygon
+from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.mounting import Mount
 
 # Mitres longer than this many half thicknesses are cut off.
@@ -55,7 +56,7 @@ def read_obstacles(
     tables
         The tables ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``.
     materials
-        Information fractions by name.
+        Information fractions by name; they override those of the standard materials.
     blocked
         Information fraction of obstacles without their own.
     """
@@ -106,12 +107,14 @@ def _share(name: str, table: Mapping[str, Any], materials: Mapping[str, float]) 
     if material is not None and share is not None:
         raise ValueError(f"{name} must have either material or information, got both")
     if material is not None:
-        if material not in materials:
-            known = ", ".join(map(repr, materials)) or "none"
+        known = {**MATERIALS, **materials}
+        if material not in known:
             raise ValueError(
-                f"{name}.material must be one of [materials], which has {known}, got {material!r}"
+                f"{name}.material must be one of [materials], which has "
+                f"{', '.join(map(repr, materials)) or 'none'}, or a standard material: "
+                f"{', '.join(map(repr, MATERIALS))}; got {material!r}"
             )
-        return materials[material]
+        return known[material]
     return math.nan if share is None else share
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.plans.drawing import Drawing, Shape
 from rbl_gym.placement.plans.pairs import centre_lines
 from rbl_gym.placement.plans.parts import (
@@ -21,7 +22,7 @@ from rbl_gym.placement.plans.parts import (
     rounded,
     spots_of,
 )
-from rbl_gym.placement.plans.uses import KEYS, KINDS, MATERIALS, TEXTS, Use, number
+from rbl_gym.placement.plans.uses import KEYS, KINDS, TEXTS, Use, number
 
 __all__ = ["Building", "building"]
 

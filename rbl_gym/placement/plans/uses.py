@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-__all__ = ["KEYS", "KINDS", "MATERIALS", "Use", "parse_use"]
+from rbl_gym.placement.file_keys import MATERIALS
+
+__all__ = ["KEYS", "KINDS", "Use", "parse_use"]
 
 # Kinds of use, with the allowed keys of their entries: those of the file, and `side_by_side_m`, the
 # maximum distance of the two lines of a wall.
@@ -22,15 +24,6 @@ KEYS = {
 }
 KINDS = tuple(KEYS)
 TEXTS = {"material", "name", "attitude", "kind", "side"}
-# Share of the information of a link after one crossing, 10^(-loss / 10 dB); rough at 6 GHz.
-MATERIALS = {
-    "drywall": 0.7,
-    "glass": 0.6,
-    "wood": 0.5,
-    "brick": 0.15,
-    "concrete": 0.05,
-    "metal": 0.0,
-}
 
 
 class Use(NamedTuple):
