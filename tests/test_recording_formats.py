@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +83,17 @@ def test_columns_are_mapped_and_others_are_named_once(tmp_path):
 def test_a_column_that_is_mapped_and_not_there(tmp_path):
     with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'to' for anchor"):
         read_as(tmp_path, LONG, columns={"anchor": "to"})
-    with pytest.raises(ValueError, match=r"missing column 't', .* by columns, --columns t=NAME$"):
+    with pytest.raises(ValueError, match=r"missing column 't', .*; state it by --columns t=NAME$"):
         read(tmp_path, LONG.replace("t,", "when,", 1))
-    message = r"anchors.csv, line 1: missing column 'x', 'y', 'z', got .* "
+    message = r"anchors.csv, line 1: missing columns 'x', 'y', 'z', got .* "
     names = "anchors.x=NAME,anchors.y=NAME,anchors.z=NAME"
     with pytest.raises(ValueError, match=f"{message}.*--columns {names}$"):
         read(tmp_path, anchors="anchor,px,py,pz\nA,0,0,1\n")
+    # All missing columns of a file are named at once, its own ones in their order.
+    header = "stamp_ms,beacon,node,dist_m"
+    message = rf"columns 'anchor', 'tag', got {re.escape(repr(header.split(',')))}; state them by "
+    with pytest.raises(ValueError, match=f"{message}--columns anchor=NAME,tag=NAME$"):
+        read(tmp_path, LONG.replace("t,anchor,tag,range", header, 1))
     columns = {f"anchors.{axis}": f"p{axis}" for axis in "xyz"}
     files = write(tmp_path, ranges=LONG, anchors=ANCHORS.replace("x,y,z", "px,py,pz"), tags=TAGS)
     assert read_recording(**files, format=Format(columns=columns)).anchors.shape == (3, 3)

@@ -151,7 +151,10 @@ ERRORS = {
     "header only": ({"anchors": "anchor,x,y,z\n"}, r"anchors.csv: must have .* rows, got 1 lines"),
     "binary": ({"ranges": b"\x93NUMPY\x01\x00"}, r"ranges.csv: must be UTF-8 text, .* at 0"),
     "utf-16": ({"tags": TAGS.encode("utf-16")}, r"tags.csv: must be UTF-8 text"),
-    "zeros": ({"ranges": b"\0\0\0\n\0"}, r"ranges.csv, line 1: missing column 't'"),
+    "zeros": (
+        {"ranges": b"\0\0\0\n\0"},
+        r"ranges.csv, line 1: must have columns .* --columns t=NAME,",
+    ),
     "open quote": ({"tags": TAGS + '"3,0,0,0\n'}, r"tags.csv, line \d: unexpected end of data"),
     "ragged": ({"ranges": LONG + "0.2,A,1\n"}, r"ranges.csv, line 6: must have 4 .*, got 3"),
     "ragged wide": ({"ranges": WIDE + "0.2\n"}, r"ranges.csv, line 4: must have 5 .*, got 1"),

@@ -110,9 +110,9 @@ def test_columns_are_mapped_and_what_is_not_read_is_named(tmp_path):
 QUATERNION = "t,x,y,z,qw,qx,qy,qz\n"
 REFUSED = {
     "no unit of the angle": ("t,x,y,yaw\n1,1,1,1\n", "line 1: column 'yaw' must state its unit"),
-    "both units": ("t,x,y,yaw_deg,yaw_rad\n1,1,1,1,1\n", "column 'yaw' must state its unit"),
-    "half a quaternion": ("t,x,y,z,qw,qx\n1,1,1,1,1,0\n", "line 1: missing column 'qy'"),
-    "roll alone": ("t,x,y,z,roll_deg\n1,1,1,1,1\n", "line 1: missing column 'pitch_deg'"),
+    "both units": ("t,x,y,yaw_deg,yaw_rad\n1,1,1,1,1\n", "must have one of the columns"),
+    "half a quaternion": ("t,x,y,z,qw,qx\n1,1,1,1,1,0\n", "line 1: missing columns 'qy', 'qz'"),
+    "roll alone": ("t,x,y,z,roll_deg\n1,1,1,1,1\n", "missing columns 'pitch_deg', 'yaw_deg'"),
     "no pitch": ("t,x,y,z,roll_deg,yaw_deg\n1,1,1,1,1,1\n", "missing column 'pitch_deg'"),
     "no y": ("t,x,z\n1,1,1\n", "line 1: missing column 'y'"),
     "two places": ("t,px,tx,y\n1,1,1,1\n", "line 1: missing column 'x'"),
@@ -134,6 +134,16 @@ def test_what_is_wrong_is_named(name, tmp_path):
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"truth\.csv, .*{message}"):
         read_truth(path)
+
+
+def test_the_unit_of_an_angle_is_stated_as_the_error_says(tmp_path):
+    path = tmp_path / "truth.csv"
+    path.write_text("t,x,y,yaw\n1,1,2,0.5\n")
+    told = r"--columns truth.yaw_rad=yaw or --columns truth.yaw_deg=yaw$"
+    with pytest.raises(ValueError, match=f"yaw_deg or yaw_rad, or state it by {told}"):
+        read_truth(path, Source(file="truth"))
+    found: Any = read_truth(path, Source({"yaw_rad": "yaw"}, file="truth"))
+    np.testing.assert_allclose(found.rotation[0], Rotation.from_euler("z", 0.5).as_matrix())
 
 
 def test_a_recording_takes_it(tmp_path):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # Largest number of rows of a terminal table: those with the largest residuals.
 _ROWS = 12
 _HONEST, _BAND = "#1c7ed6", "#868e96"
-_HEADINGS = ("ranges", "mean (m)", "spread (m)", "refused (%)")
+_HEADINGS = ("ranges", "mean (m)", "spread (m)", "rejected (%)")
 
 
 def print_consistency(console: Any, result: dict[str, Any]) -> None:
@@ -68,7 +68,8 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
 
     found = replayed.track.innovations
     assert found is not None
-    when, ratio, low, high = nis_curve(replayed.track.times, found)
+    times = replayed.track.times
+    when, ratio, low, high = nis_curve(times - times[0], found)
     axes.fill_between(when, low, high, color="0.85", lw=0, label="95 % of a consistent filter")
     ratio = np.clip(ratio, 1e-3, 1e6)
     axes.plot(when, ratio, color=_HONEST, lw=0.8)
@@ -78,8 +79,9 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set(xlabel="time [s]", ylabel="NIS / dof")
-    axes.legend(fontsize=7, loc="lower right")
+    axes.set(xlabel="time since the start [s]", ylabel="NIS / dof")
+    # Above the panel, where no curve is.
+    axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2)
     axes.grid(True)
 
 
@@ -133,14 +135,13 @@ def _charts(replayed: Replayed) -> Any:
 
     track, found = replayed.track, replayed.track.innovations
     assert found is not None
-    when, ratio, low, high = nis_curve(track.times, found)
-    when = when - track.times[0]
+    when, ratio, low, high = nis_curve(track.times - track.times[0], found)
     shown = make_subplots(
         1,
         3,
         column_widths=[0.46, 0.27, 0.27],
         horizontal_spacing=0.13,
-        subplot_titles=["NIS per degree of freedom", "mean residual (m)", "refused (%)"],
+        subplot_titles=["NIS per degree of freedom", "mean residual (m)", "rejected (%)"],
     )
     for values, fill in ((high, None), (low, "tonexty")):
         style: dict[str, Any] = {"mode": "lines", "line": {"color": _BAND, "width": 0}}
@@ -148,7 +149,7 @@ def _charts(replayed: Replayed) -> Any:
     line = {"color": _HONEST, "width": 1.2}
     shown.add_scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line, row=1, col=1)
     shown.update_yaxes(type="log", dtick=1, row=1, col=1)
-    shown.update_xaxes(title_text="time (s)", title_standoff=4, row=1, col=1)
+    shown.update_xaxes(title_text="time since the start (s)", title_standoff=4, row=1, col=1)
     rows = replayed.figures["consistency"]["residuals"]["links"]
     anchors, tags = (list(dict.fromkeys(row[kind] for row in rows)) for kind in ("anchor", "tag"))
     mean, refused = np.full((2, len(anchors), len(tags)), np.nan)

@@ -310,9 +310,9 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
                 values = errors.position
                 if row and errors.yaw is not None:
                     values = np.rad2deg(errors.yaw)
-                times = track.times[errors.known]
+                times = track.times[errors.known] - track.times[0]
                 axes.plot(times, values[errors.known], color=COLOURS[colour], lw=0.8)
-        axes.set(xlabel="time [s]", ylabel=label)
+        axes.set(xlabel="time since the start [s]", ylabel=label)
         axes.grid(True)
     if track.innovations is not None:
         draw_nis(figure.add_subplot(grid[-1, 1]), replayed)

@@ -95,8 +95,8 @@ def print_replay(result: dict[str, Any]) -> None:
     if "microseconds_per_epoch" in result:
         speed = f", {result['microseconds_per_epoch']:.0f} us an epoch"
     console.print(
-        f"{result['epochs']} epochs, {result['links']} ranges in {result['duration_s']:.1f} s, "
-        f"filter {result['settings']['filter']}{speed}"
+        f"{result['epochs']} epochs, {result['links']} ranges in a log of "
+        f"{result['duration_s']:.1f} s, filter {result['settings']['filter']}{speed}"
     )
     if "smoothed" in result:
         fit = result["smoothed"]
@@ -139,7 +139,7 @@ def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -
     mean = f"mean yaw error {result['yaw_mean_deg']:.2f} deg, " if "yaw_mean_deg" in result else ""
     console.print(
         f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: consistent; above: "
-        "overconfident)"
+        "overconfident; below: too cautious)"
     )
 
 

@@ -88,7 +88,7 @@ def track_figure(story: Story) -> go.Figure:
         updatemenus=[_play()],
     )
     if rows == 2:
-        shown.update_xaxes(title_text="time (s)", title_standoff=4)
+        shown.update_xaxes(title_text="time since the start (s)", title_standoff=4)
         for column, (low, high) in zip((1, 3), tops, strict=False):
             shown.update_yaxes(range=[low, high], row=2, col=column)
         shown.update_yaxes(

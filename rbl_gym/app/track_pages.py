@@ -160,7 +160,8 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
         parts.append(
             page.note(
-                f"NEES per degree of freedom {result['anees']:.2f} (1: consistent); "
+                f"NEES per degree of freedom {result['anees']:.2f} (1: consistent; above: "
+                "overconfident; below: too cautious); "
                 f"{'; '.join(compared(result))}."
             )
         )

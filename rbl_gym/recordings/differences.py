@@ -14,7 +14,7 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.measurements import offsets
 from rbl_gym.recordings.format import Format
-from rbl_gym.recordings.measured import Measured, ids_of, judge, measured_of, scale_of
+from rbl_gym.recordings.measured import Measured, id_columns, ids_of, judge, measured_of, scale_of
 from rbl_gym.recordings.points import Points
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import Ids, IntArray, Table
@@ -38,7 +38,7 @@ def read_differences(
     ValueError
         If columns are missing, or the anchor positions are not given.
     """
-    table.require("t", "anchor_a", "anchor_b", "difference")
+    table.require("t", "anchor_a", "anchor_b", *id_columns(tag=tags), "difference")
     if anchors is None:
         raise ValueError(f"{table.path}: time differences need a table of anchors")
     ids = anchors.ids, ids_of(table, "tag", tags)

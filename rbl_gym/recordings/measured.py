@@ -89,11 +89,11 @@ def read_measured(
         return _read_wide(table, anchors, tags, format, said)
     if table.columns.keys().isdisjoint(("anchor", "tag", "range", "ax")):
         return _read_wide(table, anchors, tags, format, said)
-    table.require("t", "range")
+    places = ("ax", "ay") if anchors is None else ()
+    table.require("t", *id_columns(anchor=anchors, tag=tags), "range", *places)
     read = {"t", "range", "run"}
     anchor_ids = ids_of(table, "anchor", anchors)
     if anchors is None:
-        table.require("ax", "ay")
         read |= {"ax", "ay", "az"}
     ids = anchor_ids, ids_of(table, "tag", tags)
     none = np.zeros(len(table.lines), dtype=np.intp)
@@ -143,9 +143,14 @@ def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
                 f"{table.path}: ranges of several tags need a table of tags, got {ids!r:.200}"
             )
         return ids
-    if column not in table.columns and len(points.ids) > 1:
-        table.require(column)
     return points.ids
+
+
+def id_columns(**points: Points | None) -> tuple[str, ...]:
+    """Return the columns that a long table must have: of points with more than one id."""
+    return tuple(
+        column for column, found in points.items() if found is not None and len(found.ids) > 1
+    )
 
 
 def _read_wide(
@@ -153,17 +158,20 @@ def _read_wide(
 ) -> tuple[Measured, Ids]:
     """Read a table with one row per epoch and one column per link."""
     columns = format.of("ranges").columns
-    table.require("t")
     if anchors is None:
         raise ValueError(f"{table.path}: columns for links need a table of anchors")
     pattern = columns.get("range", _WIDE)
     links, ids = _links_of(table, pattern, anchors.ids, None if tags is None else tags.ids)
     names = list(links)
     if not names:
+        long = [name for name in ("t", *id_columns(anchor=anchors, tag=tags), "range")
+                if name not in table.columns]  # fmt: skip
         raise ValueError(
             f"{table.path}, line {table.header_line}: must have columns {pattern!r} of "
-            f"{ids!r:.200}, or t, anchor, tag, range; got {[*table.names.values()]!r:.200}"
+            f"{ids!r:.200}, or t, anchor, tag, range; got {[*table.names.values()]!r:.200}; state "
+            f"them by --columns {table.source.given(**dict.fromkeys(long, 'NAME'))}"
         )
+    table.require("t")
     scale = scale_of(table, "range", format, said)
     rows, width = len(table.lines), len(names)
     values = scale * np.stack([table.numbers(n, may_be_missing=True) for n in names], axis=1)

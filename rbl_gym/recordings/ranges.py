@@ -53,7 +53,6 @@ def read_log(
     ValueError
         As in `rbl_gym.recordings.read_recording`.
     """
-    table.require("t")
     if format.strict and table.cut:
         raise ValueError(f"{table.path}, line {table.cut}: the last line is cut off")
     other = None

@@ -74,7 +74,7 @@ class Table(NamedTuple):
     header_line: int
     lines: NDArray[np.int64]
     columns: dict[str, NDArray[np.object_]]  # by content, or else by name in the file
-    names: dict[str, str]  # in the file
+    names: dict[str, str]  # in the file, in its order
     units: dict[str, str]  # given in the header
     decimal: str  # "." or ","
     cut: int | None  # line of a last row that was cut off and left out
@@ -86,13 +86,14 @@ class Table(NamedTuple):
         missing = [column for column in columns if column not in self.columns]
         if not missing:
             return
+        several = len(missing) > 1
         text = (
-            f"{self.path}, line {self.header_line}: missing column "
+            f"{self.path}, line {self.header_line}: missing column{'s' if several else ''} "
             f"{', '.join(map(repr, missing))}, got {[*self.names.values()]!r:.200}"
         )
         if self.source.file:
             names = self.source.given(**dict.fromkeys(missing, "NAME"))
-            text += f"; name it by columns, --columns {names}"
+            text += f"; state {'them' if several else 'it'} by --columns {names}"
         raise ValueError(text)
 
     def name(self, column: str) -> str:
@@ -284,7 +285,7 @@ def _column(cells: tuple[str, ...]) -> NDArray[np.object_]:
 def _roles(
     where: str, header: list[str], columns: dict[str, str], source: Source
 ) -> dict[str, str]:
-    """Return the names in the file by the content of the columns."""
+    """Return the names in the file by the content of the columns, in the order of the file."""
     if "time" in columns:
         columns["t"] = columns.pop("time")
     names: dict[str, str] = {}
@@ -298,6 +299,7 @@ def _roles(
                 names[name[len(before) : len(name) - len(after)]] = name
         if not names:
             raise ValueError(f"{where}: no column fits {pattern!r}, got {header!r:.200}")
+    absent = []
     for role, name in columns.items():
         if "{" in name:
             continue  # a pattern of links
@@ -307,8 +309,11 @@ def _roles(
                 raise ValueError(
                     f"{where}: {role!r} is not a known quantity; did you mean {swapped}?"
                 )
-            raise ValueError(f"{where}: missing column {name!r} for {role}, got {header!r:.200}")
+            absent.append(f"{name!r} for {role}")
         names[role] = name
+    if absent:
+        word = "column" if len(absent) == 1 else "columns"
+        raise ValueError(f"{where}: missing {word} {', '.join(absent)}, got {header!r:.200}")
     taken = set(names.values())
     for role, others in _OTHER_NAMES.items():
         if role in names or role in header:
@@ -321,7 +326,8 @@ def _roles(
             taken.add(like[0])
     # A column whose name is used for another one is kept in brackets.
     left = [name for name in header if name not in taken]
-    return names | {f"({name})" if name in names else name: name for name in left}
+    names |= {f"({name})" if name in names else name: name for name in left}
+    return dict(sorted(names.items(), key=lambda pair: header.index(pair[1])))
 
 
 def is_first(values: ArrayLike) -> BoolArray:

@@ -159,12 +159,21 @@ def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
         names = [name for name in (f"{angle}_deg", f"{angle}_rad") if name in table.columns]
         if len(names) == 1:
             columns[axis] = names[0]
-        elif angle in table.columns or names:
+        elif names:
             raise ValueError(
-                f"{table.path}, line {table.header_line}: column {angle!r} must state its unit: "
-                f"name it {angle}_deg or {angle}_rad (by columns, {angle}_deg=NAME), got "
-                f"{[*table.names.values()]!r:.200}"
+                f"{table.path}, line {table.header_line}: must have one of the columns "
+                f"{angle}_deg and {angle}_rad, got {[*table.names.values()]!r:.200}"
             )
+        elif angle in table.columns:
+            text = (
+                f"{table.path}, line {table.header_line}: column {table.name(angle)!r} must state "
+                f"its unit: name it {angle}_deg or {angle}_rad"
+            )
+            if table.source.file:
+                given = (table.source.given(**{f"{angle}_{unit}": table.name(angle)})
+                         for unit in ("rad", "deg"))  # fmt: skip
+                text += f", or state it by {' or '.join(f'--columns {told}' for told in given)}"
+            raise ValueError(text)
     if not columns:
         return None, ()
     if len(columns) == 2 or 2 not in columns:

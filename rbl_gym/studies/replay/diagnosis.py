@@ -34,9 +34,9 @@ def diagnose(
         notes = []
         if ratio < _WIDE:
             notes.append(
-                "Note: the filter expects more scatter than the ranges show (NIS per degree of "
-                f"freedom {ratio:.2f}): right if the errors of a link are correlated in time, "
-                "else see --tune."
+                "Note: the assumed noise of the ranges looks too large for this log (NIS per "
+                f"degree of freedom {ratio:.2f}, 1: consistent), unless the errors of a link are "
+                "correlated in time. Try --tune or a smaller --range-std-m."
             )
         return {**figures, "causes": []}, notes
     if recording.offset is not None:
