@@ -73,7 +73,7 @@ def truth_of(frame: Frame) -> Pose:
 def arrays(frame: Frame) -> list[Any]:
     tracks: tuple[Tracked, ...] = frame.tracks
     beliefs = [field for track in tracks for field in track.belief]
-    return [*truth_of(frame), frame.told, *frame.links, *beliefs, *(t.refused for t in tracks)]
+    return [*truth_of(frame), frame.told, *frame.links, *beliefs, *(t.rejected for t in tracks)]
 
 
 def test_the_same_seed_gives_the_same_frames_and_another_one_others(calm):
@@ -108,7 +108,7 @@ def test_undisturbed_filters_are_honest(calm):
     for which in (0, 1):
         assert nis(calm, which, 0) == pytest.approx(1, abs=0.1)
     assert rms(calm, 0) < 0.1
-    assert all(not f.tracks[0].refused.any() and f.links.measured.all() for f in calm)
+    assert all(not f.tracks[0].rejected.any() and f.links.measured.all() for f in calm)
 
 
 def test_reflected_paths_break_the_filter_and_the_robust_one_holds(calm):
@@ -121,12 +121,12 @@ def test_reflected_paths_break_the_filter_and_the_robust_one_holds(calm):
     assert nis(run, 0) > 3
     assert rms(run, 1) < 1.5 * rms(calm, 1)
     assert nis(run, 1) == pytest.approx(1, abs=0.15)
-    refused = np.array([f.tracks[1].refused for f in run[SET_IN:]])
+    rejected = np.array([f.tracks[1].rejected for f in run[SET_IN:]])
     nlos = np.array([f.links.reflected for f in run[SET_IN:]])
-    # 5 m are 50 standard deviations: all are refused, and hardly any other.
-    assert refused[nlos].all()
-    assert refused[~nlos].mean() < 0.01
-    assert not any(f.tracks[0].refused.any() for f in run)
+    # 5 m are 50 standard deviations: all are rejected, and hardly any other.
+    assert rejected[nlos].all()
+    assert rejected[~nlos].mean() < 0.01
+    assert not any(f.tracks[0].rejected.any() for f in run)
 
 
 def test_lost_links_give_no_range_and_leave_filters_honest():
@@ -147,7 +147,7 @@ def test_a_wrong_anchor_raises_the_nis_and_the_robust_filter_is_nearer(calm):
 
 
 def test_twice_the_noise_is_four_times_the_nis():
-    # Of ranges that are refused beyond four standard deviations some are missing.
+    # Of ranges that are rejected beyond four standard deviations some are missing.
     assert 2.4 < nis(played(noise=2.0), 0) < 4
 
 
@@ -158,12 +158,12 @@ def test_a_filter_by_its_label():
 
 
 def test_kinds_of_links():
-    assert LINKS == ("lost", "used", "reflected", "refused", "behind an obstacle")
+    assert LINKS == ("lost", "used", "reflected", "rejected", "behind an obstacle")
     measured = np.array([[True, True, True, False, True]])
     reflected = np.array([[False, True, True, False, False]])
     links = Links(measured, reflected, np.array([[False, True, True, True, True]]))
-    refused = np.array([[False, False, True, False, False]])
-    assert link_kinds(links, refused).tolist() == [[1, 2, 3, 0, 4]]
+    rejected = np.array([[False, False, True, False, False]])
+    assert link_kinds(links, rejected).tolist() == [[1, 2, 3, 0, 4]]
     assert link_kinds(links).tolist() == [[1, 2, 2, 0, 4]]
 
 
@@ -224,7 +224,7 @@ def test_a_recording_is_shown_as_replay_judges_it(log):
     told = replayed.track.innovations
     assert told is not None
     np.testing.assert_allclose([f.tracks[0].nis for f in run], told.nis)
-    np.testing.assert_array_equal([f.tracks[0].refused for f in run], log.links & ~told.used)
+    np.testing.assert_array_equal([f.tracks[0].rejected for f in run], log.links & ~told.used)
     np.testing.assert_array_equal([f.links.measured for f in run], log.links)
 
 

@@ -130,7 +130,7 @@ def test_links_go_from_anchors_to_tags_by_their_kinds():
     drawn = link_lines(frame, 0, program.tags, 1.0)
     assert sum(map(len, drawn.values())) == 36
     assert len(drawn["lost"]) == 36 - frame.links.measured.sum()
-    assert len(drawn["refused"]) == frame.tracks[0].refused.sum()
+    assert len(drawn["rejected"]) == frame.tracks[0].rejected.sum()
     rotation, translation = truth_of(frame)
     assert rotation is not None
     tags = program.tags @ rotation.T + translation

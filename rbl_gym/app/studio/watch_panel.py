@@ -268,9 +268,9 @@ def _filter_row(k: int, recent: Sequence[Frame]) -> str:
         figures.append(length(track.position_m))
     if np.isfinite(track.rotation_deg):
         figures.append(f"{track.rotation_deg:.1f}&deg;")
-    refused = int(track.refused.sum())
-    if refused:
-        figures.append(f"{refused} rejected")
+    rejected = int(track.rejected.sum())
+    if rejected:
+        figures.append(f"{rejected} rejected")
     verdict, colour = "", "#495057"
     if np.isfinite(ratio):
         verdict, colour = f"NIS {ratio:.1f}", "#2b8a3e" if ratio < _TOO_SURE else "#c92a2a"

@@ -21,7 +21,7 @@ TRUTH = (33, 37, 41)
 FILTERS = ((28, 126, 214), (174, 62, 201), (12, 133, 153))
 GHOSTS = ((232, 89, 12), (12, 133, 153), (92, 148, 13))
 WRONG = (224, 49, 49)
-# Colours of links by kind: lost, used, reflected, refused, weak.
+# Colours of links by kind: lost, used, reflected, rejected, weak.
 LINK_COLOURS = ((206, 212, 218), (64, 160, 90), (224, 49, 49), (245, 159, 0), (140, 170, 225))
 LINK_WIDTHS = (0.6, 1.2, 1.8, 1.8, 0.8)
 # Minimum size of the body and size of anchors, as shares of the largest extent.
@@ -63,7 +63,7 @@ def link_lines(
     tags, enlarged
         The body (N, 3), and its enlargement factor.
     """
-    kinds = link_kinds(frame.links, frame.tracks[which].refused if frame.tracks else None)
+    kinds = link_kinds(frame.links, frame.tracks[which].rejected if frame.tracks else None)
     pose: Any = frame.truth
     if pose is None or pose.rotation is None:
         pose = frame.tracks[0].belief if frame.tracks else None

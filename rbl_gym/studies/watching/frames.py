@@ -15,8 +15,8 @@ from rbl_gym.studies.epochs import Step, innovations_of, pose_errors
 __all__ = ["LINKS", "Frame", "Links", "Named", "Pose", "Tracked", "filter_named", "link_kinds"]
 
 # Kinds of links; a link's number is an index of this tuple.
-LINKS = ("lost", "used", "reflected", "refused", "behind an obstacle")
-LOST, USED, REFLECTED, REFUSED, WEAK = range(5)
+LINKS = ("lost", "used", "reflected", "rejected", "behind an obstacle")
+LOST, USED, REFLECTED, REJECTED, WEAK = range(5)
 
 
 class Pose(NamedTuple):
@@ -54,7 +54,7 @@ class Tracked(NamedTuple):
         Label of the filter.
     belief
         Belief after the ranges of the epoch.
-    refused
+    rejected
         (M, N): ranges that a robust filter rejects.
     position_m, rotation_deg, nees
         Errors against the truth, and the normalised estimation error squared, of mean 6 for a
@@ -66,7 +66,7 @@ class Tracked(NamedTuple):
 
     label: str
     belief: PoseBelief
-    refused: BoolArray
+    rejected: BoolArray
     position_m: float
     rotation_deg: float
     nees: float
@@ -129,20 +129,20 @@ def filter_named(label: str) -> Named:
     return Named(label.strip(), *parse_filter(label))
 
 
-def link_kinds(links: Links, refused: BoolArray | None = None) -> np.ndarray:
+def link_kinds(links: Links, rejected: BoolArray | None = None) -> np.ndarray:
     """Return the kinds (M, N) of links as indices of `LINKS`.
 
     Parameters
     ----------
     links
         Links of a frame.
-    refused
-        (M, N), rejected ranges of a filter. A rejected reflected range counts as refused.
+    rejected
+        (M, N), rejected ranges of a filter. A rejected reflected range counts as rejected.
     """
     kinds = np.where(links.measured, np.where(links.weak, WEAK, USED), LOST)
     kinds = np.where(links.measured & links.reflected, REFLECTED, kinds)
-    if refused is not None:
-        kinds = np.where(links.measured & refused, REFUSED, kinds)
+    if rejected is not None:
+        kinds = np.where(links.measured & rejected, REJECTED, kinds)
     return kinds
 
 
@@ -167,7 +167,7 @@ def tracked(
     links = step.reading.links
     measured = np.ones(found.used.shape, np.bool_) if links is None else links
     # A filter that is not robust accepts all ranges.
-    refused = measured & ~found.used & bool(is_robust(filter))
+    rejected = measured & ~found.used & bool(is_robust(filter))
     errors = np.full(3, np.nan)
     if truth is not None and truth.rotation is not None:
         judged = pose_errors(step.belief, truth.rotation, truth.translation, tags)
@@ -175,7 +175,7 @@ def tracked(
         errors = [np.linalg.norm(move), np.rad2deg(np.linalg.norm(turn)), judged.nees]
     position, turned, nees = map(float, errors)
     nis, dof = float(found.nis), int(found.dof)
-    return Tracked(label, step.belief, refused, position, turned, nees, nis, dof)
+    return Tracked(label, step.belief, rejected, position, turned, nees, nis, dof)
 
 
 def is_robust(filter: Any) -> bool:

@@ -110,9 +110,9 @@ def _tracked(
         position, nees = errors.position[k], errors.nees[k]
         angle = errors.yaw if errors.rotation is None else errors.rotation
         turn = np.nan if angle is None else np.rad2deg(abs(angle[k]))
-    refused, nis, dof = np.zeros(links.shape, np.bool_), np.nan, 0
+    rejected, nis, dof = np.zeros(links.shape, np.bool_), np.nan, 0
     if track.innovations is not None:
         told = track.innovations
-        refused, nis, dof = links & ~told.used[k], told.nis[k], int(told.dof[k])
+        rejected, nis, dof = links & ~told.used[k], told.nis[k], int(told.dof[k])
     belief = PoseBelief(*pose, track.covariance[k], pose[0])
-    return Tracked(label, belief, refused, float(position), float(turn), float(nees), nis, dof)
+    return Tracked(label, belief, rejected, float(position), float(turn), float(nees), nis, dof)
