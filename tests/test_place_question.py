@@ -20,6 +20,7 @@ from scipy import stats
 from rbl_gym import estimators
 from rbl_gym.app import place_answer, place_report
 from rbl_gym.app.cli import main
+from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import design, scene_files
@@ -31,7 +32,7 @@ from rbl_gym.studies.placing import (
     links,
     requirements,
 )
-from tests.helpers import Told
+from tests.helpers import Told, needs
 
 # Ten brackets in a room of 12 x 8 m with a cupboard and a thin wall.
 BRACKETS = [
@@ -407,13 +408,49 @@ def test_a_zone_that_is_too_close_to_tell_is_explained():
         "name": "aisle", "verdict": "undecided", "places": 9600, "share": 0.9506,
         "share_low": 0.9461, "share_high": 0.9548, "required": {"share": 0.95},
     }  # fmt: skip
-    (warning,) = place_answer.warnings({"coplanar": False, "zones": [row, {"verdict": "pass"}]})
+    (warning,) = place_answer.warnings(
+        {"coplanar": False, "zones": [row, {"verdict": "pass"}], "check": {"filters": {}}}
+    )
     assert warning.startswith(
         "aisle is too close to tell: 95.1 % of 9600 places are within the limits (95 % interval "
         "94.61 to 95.48 %), and 95 % must be."
     )
     result = {"survive": 0, "n_anchors": 6, "verdict": "undecided", "zones": [row], "layouts": {}}
     assert place_report.verdict(result) == "TOO CLOSE TO TELL: 6 anchors, 0 of 1 zones pass."
+
+
+def test_a_check_that_contradicts_the_prediction_is_told_at_the_top():
+    good = {"found": 1.0, "holds": True, "position_ratio": 1.0, "rotation_ratio": 1.0}
+    bad = good | {"holds": False, "position_ratio": 3.7}
+    result = {"coplanar": False, "zones": [], "check": {"filters": {"a": good, "b": bad}}}
+    (warning,) = place_answer.warnings(result)
+    assert "the errors of 'b' are 3.7 times the predicted ones" in warning
+    assert "mirror" not in warning
+    result["check"]["filters"] = {"a": good, "b": bad | {"found": 0.986}}
+    *_, warning = place_answer.warnings(result | {"coplanar": True})
+    assert "'b' finds 1.4 % of the bodies elsewhere or not at all; see the table" in warning
+    assert warning.endswith("Probable cause: the mirror image behind the plane of the anchors.")
+    result["check"]["filters"] = {"a": good}
+    assert place_answer.warnings(result) == []
+
+
+@needs("rich")
+def test_no_heading_of_the_check_is_cut(capsys):
+    parts = ("position", "m"), ("rotation", "deg")
+    row = {"found": 1.0, "holds": False, "nees": 123.4, "zones": []} | {
+        key: 0.012345
+        for name, unit in parts
+        for key in (f"{name}_rmse_{unit}", f"{name}_p95_{unit}", f"{name}_predicted_{unit}")
+    }
+    row |= {f"{name}_ratio": 3.755 for name, _ in parts}
+    check = {"trials": 500, "filters": {"iterated EKF, not told": row}}
+    rows = place_report._check(check)
+    table = new_table(rows.title, rows.headings[:1], rows.headings[1:], whole=1)
+    table.add_row(*rows.rows[0])
+    new_console().print(table)
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    assert all(word in shown for heading in rows.headings for word in heading.split())
 
 
 def test_the_verdict_says_what_to_do_next():

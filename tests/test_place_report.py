@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 pytest.importorskip("shapely", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
@@ -203,6 +204,25 @@ def test_the_relative_map_is_the_largest_error_to_its_limit(placed):
     np.testing.assert_allclose(found, one.heading / 0.01)
     other = shapes.maps_of(placed.problem, placed.design.anchors)[2]
     assert np.isnan(shapes.values_of(placed.problem.zones[2], other, "relative")).all()
+
+
+@pytest.mark.parametrize(
+    ("method", "own", "told"),
+    [
+        ("search from greedy 4", "designed", True),
+        ("search from greedy 4, exchanges for requirements", "designed", False),
+        ("least number", "designed", False),
+        ("given", "given", False),
+    ],
+)
+def test_the_chart_says_if_the_search_was_not_for_the_margin(method, own, told):
+    def row(margin):
+        return {"verdict": "pass", "zones": [{"margin": margin}]}
+
+    result = row(1.2) | {"method": method, "layouts": {own: row(1.2), "ring": row(1.5)}}
+    axes = Figure().add_subplot()
+    place_figures.draw_chart(axes, result)
+    assert ("minimised b, not this margin" in axes.get_xlabel()) == told
 
 
 def test_labels_lie_on_no_other(placed):

@@ -52,7 +52,10 @@ def headline(result: dict[str, Any]) -> str:
 
 
 def warnings(result: dict[str, Any]) -> list[str]:
-    """Return what a reader has to know beside the verdict: a mirror image, zones too close."""
+    """Return what a reader has to know beside the verdict.
+
+    A mirror image, zones that are too close to tell, a check that contradicts the prediction.
+    """
     found = []
     if result["coplanar"]:
         found.append(
@@ -70,7 +73,29 @@ def warnings(result: dict[str, Any]) -> list[str]:
                 f"{percent(zone['required']['share'])} must be. Treat it as not met: add an "
                 "anchor, or require a little less."
             )
-    return found
+    return found + _contradictions(result)
+
+
+def _contradictions(result: dict[str, Any]) -> list[str]:
+    """Return one warning if the check does not confirm the prediction."""
+    parts, any_lost = [], False
+    for name, figures in result["check"]["filters"].items():
+        lost = 100 * (1 - figures["found"])
+        if figures["holds"]:
+            continue
+        any_lost |= lost > 0
+        if lost > 0:
+            parts.append(f"{name!r} finds {digits(lost)} % of the bodies elsewhere or not at all")
+        else:
+            ratio = max(figures["position_ratio"], figures["rotation_ratio"])
+            parts.append(f"the errors of {name!r} are {digits(ratio)} times the predicted ones")
+    if not parts:
+        return []
+    cause = " Probable cause: the mirror image behind the plane of the anchors."
+    return [
+        f"The check does not confirm the prediction: {', '.join(parts)}; see the table 'checked by "
+        f"Monte Carlo'.{cause if any_lost and result['coplanar'] else ''}"
+    ]
 
 
 def typical(zones: list[dict[str, Any]]) -> str:
