@@ -226,7 +226,7 @@ def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     _, log, changed = FAULTS["a link"]
     lost = log.links.copy()
     lost[:, 6, 4] = False
-    log = log._replace(links=lost)
+    log = log._replace(links=lost, times=log.times + 1.7e9)
     replayed = replay.replay_recording(log, SETTINGS.changed(**changed))
     chart = consistency._charts(replayed)
     mean, refused = (trace for trace in chart.data if trace.type == "heatmap")
@@ -248,6 +248,10 @@ def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     assert "the ranges from anchor A3 to tag T1 look 0.8" in html
     axes = figures.replay_figure(log, replayed).axes[-1]
     assert axes.get_ylabel() == "NIS / dof"
+    # Clock times are drawn since the start of the log.
+    since = log.times - log.times[0]
+    np.testing.assert_allclose(np.asarray(axes.lines[0].get_xdata()), since, atol=1e-6)
+    assert 0 <= min(chart.data[2].x) < max(chart.data[2].x) <= since[-1]
     found = replayed.track.innovations
     assert found is not None
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_ydata()), found.nis / found.dof)
