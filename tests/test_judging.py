@@ -98,7 +98,7 @@ def test_a_wrong_window_is_left_out_and_counted():
     assert figures["epochs_excluded"] == 16
     assert figures["epochs_with_truth"] == 184
     assert figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
-    assert "16 epochs more are excluded" in compared(figures)[1]
+    assert "16 further epochs are excluded" in compared(figures)[1]
     with pytest.raises(
         ValueError, match="truth_exclude must leave an epoch with truth, but excludes all 200"
     ):

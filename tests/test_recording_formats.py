@@ -402,7 +402,7 @@ def test_anchors_that_move(tmp_path):
     np.testing.assert_allclose(log.anchors[:, 2], np.stack([fixed, fixed + 4, 2 + 0.5 * t], -1))
     late = "".join(f"{t},A,1,2\n" for t in (28, 29, 40))
     gone = read(tmp_path, "t,anchor,tag,range\n" + rows + late, anchors=anchors)
-    assert gone.report.dropped == {"of an anchor whose place is not known then": 1}
+    assert gone.report.dropped == {"of an anchor without a position at that time": 1}
     rare = "".join(f"A,{t},{t},0,1\n" for t in (0, 1, 2, 3, 9))
     holed = read(tmp_path, anchors="anchor,t,x,y,z\n" + rare + "B,0,4,0,1\nC,0,0,4,2\n")
     assert "'A' has no position for 6 s (usually 1 s)" in note_of(holed, "straight motion")

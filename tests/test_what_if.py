@@ -21,7 +21,7 @@ def found():
     return what_if.what_if(SCENE, 4, 1)
 
 
-def row(found, motion, unknown="nothing more"):
+def row(found, motion, unknown="none"):
     (one,) = [r for r in found["rows"] if (r["motion"], r["unknown"]) == (motion, unknown)]
     return one
 
@@ -34,7 +34,7 @@ def test_rows_with_nothing_unknown_are_the_bounds_of_the_scenes(found):
     assert got["position_m"] == pytest.approx(np.sqrt(square[..., 3:].sum(-1).mean()), rel=1e-9)
     late = square[len(square) // 2 :, :, 3:].sum(-1).mean()
     assert got["late_position_m"] == pytest.approx(np.sqrt(late), rel=1e-9)
-    # And with the twist told, by the plain recursion.
+    # And with the known twist, by the plain recursion.
     J, squares = np.linalg.inv(scene.prior_covariance), []
     for k in range(9):
         at = simulation.epoch_of(drawn.episode, k)
@@ -44,15 +44,15 @@ def test_rows_with_nothing_unknown_are_the_bounds_of_the_scenes(found):
         )  # fmt: skip
         squares.append(np.diagonal(np.linalg.inv(J), axis1=-2, axis2=-1))
     turn = np.rad2deg(np.sqrt(np.array(squares)[..., :3].sum(-1).mean()))
-    assert row(found, "twist told")["rotation_deg"] == pytest.approx(turn, rel=1e-9)
+    assert row(found, "known twist")["rotation_deg"] == pytest.approx(turn, rel=1e-9)
 
 
 def test_what_is_not_known_costs_and_what_tells_more_gains(found):
     motions = {r["motion"] for r in found["rows"]}
-    assert motions == {"ranges alone", "twist told", *(f"{name} IMU" for name in SENSORS)}
+    assert motions == {"ranges alone", "known twist", *(f"{name} IMU" for name in SENSORS)}
     for motion in motions:
         surveys = [f"anchors to {100 * std:g} cm" for std in what_if.SURVEYS_M]
-        errors = [row(found, motion, u)["position_m"] for u in ("nothing more", *surveys)]
+        errors = [row(found, motion, u)["position_m"] for u in ("none", *surveys)]
         assert (np.diff(errors) > 0).all()
         for unknown in ("biases of links", "offset of each tag"):
             assert row(found, motion, unknown)["tags_m"] > row(found, motion)["tags_m"]
@@ -77,7 +77,7 @@ def test_a_scene_keeps_what_is_its_own():
     own["inertial"] = {"kind": "consumer", "gyro_noise": 1e-3}
     found = what_if.what_if(own, 2, 0)
     unknowns = {r["unknown"] for r in found["rows"]}
-    assert unknowns == {"nothing more", "anchors to 10 cm", "biases of links"}
+    assert unknowns == {"none", "anchors to 10 cm", "biases of links"}
     assert row(found, "own IMU")["rotation_deg"] > row(found, "consumer IMU")["rotation_deg"]
 
 

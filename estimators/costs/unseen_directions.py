@@ -1,11 +1,11 @@
 """Covariance of an update along directions that its epoch does not observe.
 
-Ranges to collinear tags do not determine the body's roll about their line, and the line rotates
-with the body. The update moves the prior's information to the new pose by ``Jl^-1(log(Q Q_-^T))``,
-the derivative of its residual. This is halfway between the old line and the new one. Each update
-then turns a little information about other directions into information about the roll. After many
-updates the filter would be overconfident in the roll. Here the information is rotated with the
-body, so that the uncertain direction stays on the line.
+Ranges to collinear tags do not determine the roll of the body about their line. The line rotates
+with the body. A usual update moves the prior's information to the new pose by the derivative of its
+residual, ``Jl^-1(log(Q Q_-^T))``, which rotates it only half of the way. The uncertain direction
+then leaves the line: every update adds a little information about the roll that the ranges do not
+have. After many updates the filter is overconfident in the roll. This module rotates the
+information with the body, so that the uncertain direction stays on the line.
 """
 
 from __future__ import annotations

@@ -66,15 +66,17 @@ class ParticleSwarm:
 class ParticipatorySearch:
     """Participatory search algorithm (Liu and Gomide, Evolving Intelligence 10, 2017), as outlined.
 
-    The pool consists of individuals on [0, 1]^K. The compatibility of two is one minus their mean
-    absolute difference. Each step pairs every individual s with a random other one s'. Of the two,
-    p_s is the one more compatible with the best. ``p_r = s + alpha rho^(1-a) (s' - s)`` recombines
-    them by the participatory learning rule, with rho their compatibility. ``p_m = best + rho^(1-a)
-    (p_s - p_r)`` mutates, with rho that of p_s and p_r. p_m replaces s if it is better. New random
-    individuals then replace the worst tenth.
+    The pool consists of individuals on [0, 1]^K. The compatibility ``rho(x, y)`` of two individuals
+    is one minus their mean absolute difference. Each step pairs every individual ``s`` with a
+    random other one ``s'``:
 
-    Assumed: 400 individuals, 200 steps, alpha = 0.5 (learning rate), a = 0 (no arousal),
-    distances up to the largest that the directions allow, and the new tenth.
+    1. Selection: ``p_s`` is the one of the two that is more compatible with the best individual.
+    2. Recombination: ``p_r = s + alpha rho(s, s')^(1-a) (s' - s)``.
+    3. Mutation: ``p_m = best + rho(p_s, p_r)^(1-a) (p_s - p_r)``.
+    4. ``p_m`` replaces ``s`` if it is better.
+
+    New random individuals then replace the worst tenth. The paper does not give the settings: 400
+    individuals, 200 steps, learning rate alpha = 0.5, arousal a = 0, and the new tenth.
     """
 
     size: int = 400

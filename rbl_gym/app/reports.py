@@ -178,7 +178,7 @@ def compared(result: dict[str, Any]) -> list[str]:
         f"({result['truth_format']})"
     ]
     if "epochs_excluded" in result:
-        parts.append(f"{result['epochs_excluded']} epochs more are excluded (truth_exclude)")
+        parts.append(f"{result['epochs_excluded']} further epochs are excluded (truth_exclude)")
     for what in ("odometry", "imu"):
         if (found := result.get(f"{what}_clock")) is None:
             continue
@@ -234,9 +234,9 @@ def print_training(result: dict[str, Any]) -> None:
     held_out = result["held_out"]
     returns = {name: held_out[f"{name}_mean_return"] for name in ("policy", "random")}
     console.print(
-        f"mean return in {held_out['worlds']} held-out worlds: {returns['policy']:.4f} +- "
-        f"{held_out['policy_std_error']:.4f} of the policy as saved (it plays the most likely "
-        f"action), {returns['random']:.4f} +- {held_out['random_std_error']:.4f} of random actions"
+        f"mean return in {held_out['worlds']} held-out worlds: policy {returns['policy']:.4f} +- "
+        f"{held_out['policy_std_error']:.4f} (with its most likely actions), random actions "
+        f"{returns['random']:.4f} +- {held_out['random_std_error']:.4f}"
     )
     if returns["policy"] <= returns["random"]:
         console.print("The policy is NO BETTER THAN RANDOM ACTIONS: train longer (--steps).")

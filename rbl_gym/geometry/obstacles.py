@@ -305,9 +305,9 @@ def _meets(
 ) -> BoolArray:
     """Return which segments (S, 3) run inside a prism.
 
-    The line of the segment, shifted infinitesimally to the left and to the right, is inside the
-    polygon between odd and even crossings of its edges. The segment is inside where both shifted
-    lines are. Along an edge, one of them is outside.
+    The line of the segment is shifted slightly to the left and to the right. A shifted line enters
+    the polygon at its odd crossings of edges and leaves it at its even ones. The segment is inside
+    if both shifted lines are. If the segment runs along an edge, one of them is outside.
     """
     along = end - start
     length = np.sqrt((along**2).sum(axis=-1))

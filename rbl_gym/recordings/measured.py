@@ -37,7 +37,7 @@ _CAUSES = {
     "to an unknown anchor": ("unknown anchor", "anchor_b"),
     "of an anchor to itself": ("must be another anchor than anchor_a", "anchor_b"),
     "twice with two values": ("each link may come once at a time", "range"),
-    "of an anchor whose place is not known then": ("the anchor's place must be known", "t"),
+    "of an anchor without a position at that time": ("the anchor must have a position", "t"),
 }
 _NAMES = [*_CAUSES]
 # Advice if one cause prevails.
@@ -47,7 +47,7 @@ _HINTS = {
     "of an unknown tag": "add this tag to the table of tags",
     "twice with two values": "stamps too coarse, or several runs without a column run?",
     "without a standard deviation": "is it in another column? name that column",
-    "of an anchor whose place is not known then": "do the clocks agree?",
+    "of an anchor without a position at that time": "do the clocks agree?",
 }
 _FINE = ("", "empty", "marked as not valid", "repeated")
 

@@ -75,13 +75,13 @@ def read_log(
     if tags is None:
         tags = Points(ids[1], np.zeros((1, 3)))
     known = anchors.at(times)[1][measured.row, measured.anchor]
-    measured.drop(~known, "of an anchor whose place is not known then")
+    measured.drop(~known, "of an anchor without a position at that time")
     epochs, epoch = np.unique(times[measured.row], return_inverse=True)
     if other is None:
         mark_doubles(measured, epoch)
     else:
         known = anchors.at(times)[1][measured.row, other]
-        measured.drop(~known, "of an anchor whose place is not known then")
+        measured.drop(~known, "of an anchor without a position at that time")
         mark_double_differences(measured, other, epoch)
     settle(measured, table, ids, format, said)
     used = measured.cause == 0

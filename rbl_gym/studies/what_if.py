@@ -90,7 +90,7 @@ def what_if(
 def _unknowns(scene: Scene) -> dict[str, bounds.Nuisances]:
     """Return the sets of unknowns, by name; all include the offset and survey of the scene."""
     offset, survey = scene.links.offset, scene.survey_std_m
-    found = {"nothing more": bounds.Nuisances(offset, survey)}
+    found = {"none": bounds.Nuisances(offset, survey)}
     for std in SURVEYS_M:
         if std > survey:
             found[f"anchors to {100 * std:g} cm"] = bounds.Nuisances(offset, std)
@@ -121,7 +121,7 @@ def _motions(drawn: monte_carlo.SimulatedTrials) -> dict[str, _Law]:
         "ranges alone": _Law(
             free, 12, lambda _, k: bounds.UnknownTwist(true[:, k - 1], scene.dt, still, law)
         ),
-        "twist told": _Law(
+        "known twist": _Law(
             pose, 6, lambda at, _: bounds.KnownTwist(at.twist, scene.dt, scene.process)
         ),
     }

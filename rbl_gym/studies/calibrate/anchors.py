@@ -300,7 +300,7 @@ def _result(
     said = []
     if survey.scale_std > _SCALE:
         said.append(
-            f"size of the layout to better than {100 * survey.scale_std:.2g} %: it trades off "
+            f"size of the layout to better than {100 * survey.scale_std:.2g} %: it is correlated "
             f"with the common bias (correlation {survey.scale_bias_correlation:.2f}, bias +- "
             f"{survey.bias_std_m:.3f} m); give bias_m and bias_std_m, or a known pair of anchors"
         )

@@ -102,20 +102,21 @@ def network_experiment(
 
     Returns
     -------
-    A dict of plain numbers.
+    dict
+        Plain numbers:
 
-    - ``networks`` (Fig. 3): points, footprints and edges.
-    - ``accuracy`` (Fig. 4): for each footprint the mean square error of y, of the limit psi of (14)
-      and of maximum likelihood, the bound ``2 sigma^2 (n - 1) / m``, and ratios to it.
-    - ``run`` (Figs 5 and 6): for the largest footprint, the angle of every edge and the error of
-      every loop over the steps, and true, measured and estimated orientations.
-    - ``convergence``: a row for each cycle basis and rule for kappa. It has lambda_min, lambda_max,
-      the measured and the true factor, the factor of Theorem 19, and the share of networks for
-      which the theorem holds.
-    - ``asynchronous``: rounds for each share of lost messages.
-    - ``history``: errors of a run.
-    - ``growth``: result of `network_growth.kappa_growth`.
-    - ``space``: three nodes in space.
+        - ``networks`` (Fig. 3): points, footprints and edges.
+        - ``accuracy`` (Fig. 4): for each footprint the mean square error of y, of the limit psi of
+          (14) and of maximum likelihood, the bound ``2 sigma^2 (n - 1) / m``, and ratios to it.
+        - ``run`` (Figs 5 and 6): for the largest footprint, the angle of every edge and the error
+          of every loop over the steps, and true, measured and estimated orientations.
+        - ``convergence``: a row for each cycle basis and rule for kappa. It has lambda_min,
+          lambda_max, the measured and the true factor, the factor of Theorem 19, and the share
+          of networks for which the theorem holds.
+        - ``asynchronous``: rounds for each share of lost messages.
+        - ``history``: errors of a run.
+        - ``growth``: result of `network_growth.kappa_growth`.
+        - ``space``: three nodes in space.
 
     Raises
     ------

@@ -14,16 +14,16 @@ from rbl_gym.recordings.recording import Recording
 
 __all__ = ["contradicts", "nis_curve", "residual_tables"]
 
-# The data contradict a filter if the normalised innovations squared of a log, or of a tenth of it,
-# exceed this multiple of their expectation, or if this share of the ranges is rejected,
+# The data contradict a filter if the NIS of a log, or of a part of this size, exceeds a multiple of
+# its expectation, or if more than a share of the ranges is rejected; and if the probability of this
+# by chance is below a limit.
 MOST_NIS, MOST_REFUSED, _PART = 1.5, 0.2, 0.1
-# and if the probability of this by chance is below this value.
 _CHANCE = 1e-6
 _BLOCKS = 20
-# They also do if the mean squared whitened innovation of an anchor or tag exceeds the first value,
-# and the second multiple of the median over all of them; rejected innovations are clipped. Or if
-# more than half of the innovations of a link exceed the third value, in standard deviations. Both
-# need the fourth number of ranges.
+# The data also contradict it in two other cases, each with at least `_FEWEST` ranges. First, the
+# mean squared whitened innovation of an anchor or tag (rejected ones clipped) exceeds
+# `_MOST_SQUARE`, and `_BEYOND_OTHERS` times the median over all of them. Second, more than half of
+# the innovations of a link exceed `_FAR` standard deviations.
 _MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
 
 

@@ -158,9 +158,9 @@ def fault_hints(
     Parameters
     ----------
     at
-        Function of a delay in seconds, by which the time stamps of the truth are corrected, and a
-        flag. It returns what is compared: with the rotations of the file at all epochs, or without
-        rotations at some epochs.
+        Function ``at(delay, rotations)`` that returns the compared poses. `delay`, in seconds,
+        corrects the time stamps of the truth. With `rotations` the result has the rotations of the
+        file at all epochs; without it has some epochs and no rotations.
     seen
         Function that converts rotations (L, 3, 3) of the file to those that are compared.
     planar
