@@ -221,7 +221,7 @@ def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_p
     assert main(command) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "99.0000 while exploring" in text
-    assert f"256 held-out worlds: {told['policy_mean_return']:.4f}" in text
+    assert f"256 held-out worlds: policy {told['policy_mean_return']:.4f}" in text
     assert "NO BETTER THAN RANDOM ACTIONS" in text
 
 
