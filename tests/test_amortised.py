@@ -20,7 +20,7 @@ from rbl_gym.placement.tokens import KINDS, Scenery, Tokens, tokens_of
 from rbl_gym.studies.placing import design
 from rbl_gym.studies.placing.answer import Question, place_anchors
 from rbl_gym.worlds import scenes
-from tests.helpers import ROOT, needs
+from tests.helpers import ROOT, needs, with_kernels
 
 FEET = 1 / 0.3048
 # Tolerance of the network's outputs, in units of the problem; it is played in single precision.
@@ -189,6 +189,7 @@ def test_the_score_of_a_state_is_the_score():
     np.testing.assert_allclose(state.score, expected, rtol=1e-9)
 
 
+@with_kernels
 def test_a_swap_is_nearly_the_best_of_all():
     """Brute force over all pairs: the promised swap gains most of what the best one does."""
     task, contexts, candidates, judged, state = room_state()

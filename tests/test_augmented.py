@@ -17,7 +17,7 @@ from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion import unknown_twist as ut
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
-from tests.helpers import assert_same, random_world, simulate
+from tests.helpers import assert_same, random_world, simulate, with_kernels
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
@@ -208,6 +208,7 @@ def biased_recording(rng, trials, steps, law):
     return times, anchors, tags, rotation, translation, ranges, noise, twists
 
 
+@with_kernels
 @pytest.mark.parametrize(
     ("law", "gain"),
     [(LinkBias(0.05, None, 0.2), 2.0), (LinkBias(0.05, 2.0), 1.05)],

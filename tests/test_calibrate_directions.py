@@ -20,7 +20,7 @@ from rbl_gym.estimators.calibration.turn_rates import SensorTurn, align_turn_rat
 from rbl_gym.estimators.smoothing.knowledge import Level
 from rbl_gym.recordings import InertialLog, Truth, read_frame, read_inertial, read_truth
 from rbl_gym.studies import calibrate
-from tests.helpers import ROOT
+from tests.helpers import ROOT, with_kernels
 
 STARLOC = ROOT.parent / "shared" / "data" / "starloc_two_tags"
 MURP = ROOT.parent / "shared" / "data" / "murp_relative"
@@ -87,6 +87,7 @@ def test_the_model_is_that_of_the_equations():
     assert (std > 0).all()
 
 
+@with_kernels
 def test_cross_validation_takes_the_simplest_that_serves():
     rng = np.random.default_rng(2)
     candidates = DirectionBasis(0), DirectionBasis(1)

@@ -16,6 +16,7 @@ from rbl_gym.measurements.link_bias import LinkBias, simulate_biases
 from rbl_gym.measurements.offsets import Clock, simulate_clocks
 from rbl_gym.motion import ProcessNoise, propagate
 from rbl_gym.motion import unknown_twist as ut
+from tests.helpers import with_kernels
 from tests.test_offsets import distances, groups, numeric_jacobian
 
 M, N, DT = 6, 5, 0.1
@@ -162,6 +163,7 @@ def test_what_has_no_clock_is_refused():
             estimators.make("iekf-log", **(make | {key: value}))
 
 
+@with_kernels
 @pytest.mark.parametrize("kind", ["tag", "anchor"])
 def test_with_an_unknown_twist_and_biases_it_stands_at_its_bound(kind):
     """100 trials: ratios scatter by 3 % (6 epochs that go together), NEES/6 by 6 %."""

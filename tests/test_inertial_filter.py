@@ -19,6 +19,7 @@ from rbl_gym.measurements import inertial, link_bias, ranging
 from rbl_gym.motion import navigation
 from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scene_bounds, scenes, simulation
+from tests.helpers import with_kernels
 
 TAGS = bodies.octahedron(0.8)
 ANCHORS = np.array([[-6, -5, 0.5], [6, -5, 4], [6, 5, 0], [-6, 5, 3.5], [0, -6, 2], [1, 6, 5.0]])
@@ -328,6 +329,7 @@ def test_the_tilt_of_gravity_costs_information():
     assert wide[3:].sum() > 1.001 * narrow[3:].sum()
 
 
+@with_kernels
 def test_biases_converge_within_their_covariance():
     scene = scenes.get({"name": "uwb_room", "inertial": "consumer", "steps": 60})
     trials: Any = monte_carlo.simulate_trials(scene, 100, np.random.default_rng(7))

@@ -13,7 +13,7 @@ from rbl_gym.placement import design, scene_files, setting
 from rbl_gym.placement.descent import descend
 from rbl_gym.placement.exchange import choose, refresh, swap
 from rbl_gym.placement.sample import of_context, sample
-from tests.helpers import needs
+from tests.helpers import needs, with_kernels
 
 shapely = needs("shapely")
 
@@ -194,6 +194,7 @@ def test_descent_finds_a_place_without_slope(scene):
     assert min(one.score(layout) for layout in near) > score * (1 - 1e-4)
 
 
+@with_kernels
 def test_layouts_are_legal_the_same_by_seed_and_better_past_walls_than_greedy(monkeypatch):
     monkeypatch.setattr(design, "STAGES", (64, 96, 96))
     monkeypatch.setattr(design, "_CANDIDATES", 80)

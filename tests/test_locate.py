@@ -19,7 +19,7 @@ from rbl_gym.estimators.locating import maximum_likelihood
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import noise_laws, ranging
 from rbl_gym.worlds import scenes
-from tests.helpers import load, random_world, simulate
+from tests.helpers import load, random_world, simulate, with_kernels
 
 BODY = bodies.icassp2013()
 SCENE = scenes.SCENES["icassp2013"]
@@ -228,6 +228,7 @@ def test_robust_shrugs_off_wrong_ranges(share, limit):
     assert ratios(found, bound)[1] < limit
 
 
+@with_kernels
 def test_four_anchors_at_40_db_find_the_global_optimum():
     """100 trials against brute force from 100 starts: not one is missed."""
     _, anchors, noise, ranges = paper_world(100, 40, 6, low=0, high=100, n_anchors=4)

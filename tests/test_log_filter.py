@@ -17,6 +17,7 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias, simulate_biases
 from rbl_gym.motion.unknown_twist import WanderingTwist, simulate_wandering
+from tests.helpers import with_kernels
 
 TAGS = bodies.octahedron(0.8)[:4]
 ANCHORS = np.array([[0.0, 0, 0], [10, 0, 3], [10, 8, 0], [0, 8, 3], [5, 0, 3], [5, 8, 0.5]])
@@ -67,6 +68,7 @@ def test_the_filter_for_logs_is_consistent_with_its_own_law():
     assert tracked(False, 0.0)[0] == pytest.approx(1.0, abs=0.15)
 
 
+@with_kernels
 def test_late_ranges_cost_the_redescending_loss_least_and_its_belief_stays_honest():
     """Two ranges in five late; measured: 0.51, 0.20 and 0.18 m, NEES 47, 2.5 and 1.4."""
     found = {robust: tracked(robust, 0.4) for robust in (False, True, "late")}

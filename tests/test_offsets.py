@@ -14,6 +14,7 @@ from rbl_gym.measurements import noise_laws, offsets
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.motion import ProcessNoise, propagate
 from rbl_gym.motion.unknown_twist import WanderingTwist
+from tests.helpers import with_kernels
 
 every_offset = pytest.mark.parametrize("offset", offsets.OFFSETS)
 NOISE = RangeNoise(0.05, 0.01)
@@ -322,6 +323,7 @@ def track(offset, batch=100, steps=8, seed=0, prior=(0.2, 0.5), size=30.0, name=
     return np.array(errors), np.array(beliefs), np.array(crb)
 
 
+@with_kernels
 @pytest.mark.parametrize(
     ("offset", "prior"),
     [(kind, (0.2, 0.5)) for kind in offsets.OFFSETS]

@@ -29,6 +29,7 @@ SMOOTH = replay.Settings.of(
 )
 
 
+@with_kernels
 def test_smoothed_is_nearer_than_causal_and_honest():
     replayed = replay.replay_recording(flight(TAGS, biases=0.05), SMOOTH)
     smoothed = replayed.figures["smoothed"]
@@ -46,6 +47,7 @@ def test_smoothed_is_nearer_than_causal_and_honest():
     )
 
 
+@with_kernels
 def test_moving_anchors_and_coordinates_of_a_map():
     near = replay.replay_recording(flight(TAGS, swaying), SMOOTH)
     assert near.figures["smoothed"]["position_rmse_m"] < 0.05
@@ -57,6 +59,7 @@ def test_moving_anchors_and_coordinates_of_a_map():
     )
 
 
+@with_kernels
 def test_a_start_that_lost_its_way_is_replaced():
     log, settings = flight(TAGS), SMOOTH
     track = replay.track_recording(log, settings)
