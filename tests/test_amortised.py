@@ -178,7 +178,7 @@ def room_state(n_anchors=6, batch=(2,)):
     points = np.take_along_axis(seen.candidates, index[..., None], axis=-2)
 
     def judged(layouts):
-        return swaps.judged(bound, layouts, obstacles.share(layouts, seen.places))
+        return swaps.evaluated(bound, layouts, obstacles.share(layouts, seen.places))
 
     return task, contexts, seen.candidates, judged, judged(points)
 
@@ -191,9 +191,9 @@ def test_the_score_of_a_state_is_the_score():
 
 @with_kernels
 def test_a_swap_is_nearly_the_best_of_all():
-    """Brute force over all pairs: the promised swap gains most of what the best one does."""
+    """Brute force over all pairs: the swap by the estimate gains most of what the best one does."""
     task, contexts, candidates, judged, state = room_state()
-    tried = swaps.standing(state.points, candidates)
+    tried = swaps.occupied(state.points, candidates)
     assert tried.sum() == 2 * 6 * 6
     points, pair = swaps.swapped(state, candidates, tried)
     np.testing.assert_array_equal(pair.sum(axis=(-1, -2)), [1, 1])
@@ -208,7 +208,7 @@ def test_a_swap_is_nearly_the_best_of_all():
 
 def test_the_better_state_is_kept_in_each_problem():
     *_, state = room_state()
-    other = swaps.State(state.points + 1.0, state.score * [0.5, 2.0], state.promise)
+    other = swaps.State(state.points + 1.0, state.score * [0.5, 2.0], state.decrease)
     kept, is_new = swaps.better(state, other)
     np.testing.assert_array_equal(is_new, [True, False])
     np.testing.assert_array_equal(kept.points, [other.points[0], state.points[1]])
@@ -236,7 +236,7 @@ def test_no_more_evaluations_than_asked(monkeypatch, scene, racks, evaluations):
 
     kind = setting.Setting
     monkeypatch.setattr(kind, "score_and_gradient", counted(kind.score_and_gradient))
-    monkeypatch.setattr(swaps, "judged", counted(swaps.judged))
+    monkeypatch.setattr(swaps, "evaluated", counted(swaps.evaluated))
     task, contexts = problem(scene, 5, racks)
     amortised.of_task(task, contexts, evaluations)
     assert len(count) <= evaluations

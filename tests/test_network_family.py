@@ -129,10 +129,10 @@ def test_largest_numbers_are_those_of_the_spaces():
 @pytest.mark.parametrize(
     ("scenes", "message"),
     [
-        ([], "scenes must hold at least one network"),
+        ([], "scenes must have at least one network"),
         ("uwb_room", "scenes must be a list of dicts or a dict, got 'uwb_room'"),
         (["hall"], r"scenes\[0\] must be a dict with fields of a network \(n_nodes, side_m"),
-        ([{"steps": 3}], r"scenes\[0\] must have no fields but n_nodes, .* got 'steps'"),
+        ([{"steps": 3}], r"scenes\[0\] must only have the fields n_nodes, .* got 'steps'"),
         ([{"n_nodes": 1}], r"scenes\[0\]: n_nodes must be"),
         ([{}, {"radius_m": {"uniform": [-1, 5]}}], r"scenes\[1\]: radius_m must"),
         ([{"n_nodes": {"integers": [2.5, 5]}}], r"scenes\[0\].n_nodes.integers must be two whole"),

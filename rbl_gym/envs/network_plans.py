@@ -1,4 +1,4 @@
-"""Numbers of planar networks, and families from which every episode draws them."""
+"""Parameters of planar networks, and families from which every episode draws them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TAIL = 8.0
 
 @dataclass(frozen=True)
 class NetworkPlan:
-    """Numbers of a planar network.
+    """Parameters of a planar network.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class NetworkPlan:
 
     @property
     def sensing(self) -> Sensing:
-        """What an estimator may know besides the observation."""
+        """The measurement model, which an estimator knows besides the observation."""
         return Sensing(
             bearing_std_rad=max(self.bearing_std_rad, _SHARPEST),
             length_std_m=max(self.length_std_m, _SHARPEST * self.side_m),
@@ -93,10 +93,9 @@ _LEAST = {
     "length_std_m": 1e-9,
     "step_m": 0.0,
 }
-_NAMES = tuple(field.name for field in dataclasses.fields(NetworkPlan))
-
-
-COLUMNS = ("side_m", "radius_m", "blind_m", "bearing_std_rad", "length_std_m", "step_m")
+# Fields with physical numbers, in the order of `numbers_of`.
+COLUMNS = tuple(_LEAST)
+_NAMES = ("n_nodes", *COLUMNS)
 
 
 def numbers_of(plan: NetworkPlan) -> list[float]:
@@ -145,7 +144,7 @@ class NetworkFamily:
 
     def __post_init__(self) -> None:
         if not self.members:
-            raise ValueError("scenes must hold at least one network, got none")
+            raise ValueError("scenes must have at least one network, got none")
         for index, member in enumerate(self.members):
             if not isinstance(member, Mapping):
                 raise ValueError(
@@ -155,7 +154,7 @@ class NetworkFamily:
             for name in member:
                 if name not in _NAMES:
                     raise ValueError(
-                        f"scenes[{index}] must have no fields but {', '.join(_NAMES)}, "
+                        f"scenes[{index}] must only have the fields {', '.join(_NAMES)}, "
                         f"got {name!r:.80}"
                     )
             for one in laws.corners(member, f"scenes[{index}]"):

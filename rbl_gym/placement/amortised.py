@@ -217,7 +217,7 @@ def _swapped(
     bound, candidates = swaps.bound_of(play.seen, poses), play.seen.candidates
 
     def judged(points: FloatArray) -> swaps.State:
-        return swaps.judged(bound, points, play.share(points))
+        return swaps.evaluated(bound, points, play.share(points))
 
     best, used = judged(_placed(network, play)), 1
     for image in range(1, min(_IMAGES, evaluations)):
@@ -225,11 +225,11 @@ def _swapped(
         used += 1
     away = np.abs(play.legal(candidates) - candidates).max(axis=-1)
     illegal = (away > 1e-6 * play.seen.frame()[1][..., None])[..., None, :]
-    tried = illegal | swaps.standing(best.points, candidates)
-    while used < min(_IMAGES + _SWAPS, evaluations) and (best.promise > 0)[~tried].any():
+    tried = illegal | swaps.occupied(best.points, candidates)
+    while used < min(_IMAGES + _SWAPS, evaluations) and (best.decrease > 0)[~tried].any():
         points, pair = swaps.swapped(best, candidates, tried)
         best, is_new = swaps.better(best, judged(points))
-        fresh = illegal | swaps.standing(best.points, candidates)
+        fresh = illegal | swaps.occupied(best.points, candidates)
         tried = np.where(is_new[..., None, None], fresh, tried | pair)
         used += 1
     return best.points, used

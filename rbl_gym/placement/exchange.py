@@ -25,7 +25,12 @@ _SPREADS = np.array([0.005, 0.02, 0.05, 0.15])
 _APART_M = 1e-3
 # Upper half of a 6 x 6 matrix, and the multiplicity of its entries in a product.
 _ROWS, _COLUMNS = np.triu_indices(6)
-_TIMES = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+
+
+def packed(matrices: FloatArray) -> FloatArray:
+    """Return the upper halves (..., 21) of symmetric matrices (..., 6, 6)."""
+    return matrices[..., _ROWS, _COLUMNS]
 
 
 def choose(setting: Setting, parts: FloatArray, count: int) -> list[int]:
@@ -71,15 +76,14 @@ def swap(setting: Setting, parts: FloatArray, indices: list[int], rounds: int = 
     `choose`.
     """
     found = list(indices)
-    packed = np.ascontiguousarray(parts[..., _ROWS, _COLUMNS], dtype=np.float32)
-    packed = packed.reshape(len(parts), -1)
+    halves = np.ascontiguousarray(packed(parts), dtype=np.float32).reshape(len(parts), -1)
     total = setting.sample.prior + parts[found].sum(axis=0)
     least = float(setting.squares(total))
     for _ in range(rounds):
         before = least
         for place, old in enumerate(found):
             without = total - parts[old]
-            promise = packed @ _promise(setting, without)
+            promise = halves @ _promise(setting, without)
             promise[found] = -np.inf
             some = np.argsort(-promise, kind="stable")[: min(_FOR_SWAP, len(parts) - len(found))]
             if not len(some):
@@ -100,7 +104,7 @@ def _promise(setting: Setting, information: FloatArray) -> FloatArray:
     J = bounds.tag_jacobian(sample.rotation, setting.tags)
     S = np.einsum("pnia,pnib->pab", J, J) / len(setting.tags)
     K = sample.weight[:, None, None] * (P @ S @ P)
-    return (_TIMES * K[:, _ROWS, _COLUMNS]).astype(np.float32).ravel()
+    return (MULTIPLICITY * packed(K)).astype(np.float32).ravel()
 
 
 def refresh(

@@ -1,5 +1,8 @@
 """Swaps of one anchor of a layout for a candidate, one evaluation of the score each.
 
+`exchange.swap` is for one problem and evaluates the best candidates of each anchor. Here the number
+of evaluations is limited, and many problems are solved at once.
+
 The evaluation gives, for each anchor left out, the derivative of the score by the information of
 each candidate. The pair of anchor and candidate with the best estimate from it is tried next.
 Problems may have leading axes.
@@ -14,16 +17,14 @@ import numpy as np
 from rbl_gym import bounds
 from rbl_gym.bounds.information import link_information
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.placement.exchange import MULTIPLICITY, packed
 from rbl_gym.placement.problem import weighted_square
 from rbl_gym.placement.tokens import Scenery
 
-__all__ = ["Poses", "State", "better", "bound_of", "judged", "standing", "swapped"]
+__all__ = ["Poses", "State", "better", "bound_of", "evaluated", "occupied", "swapped"]
 
 # Information without any anchor.
 _NONE = np.zeros((6, 6))
-# Upper half of a 6 x 6 matrix, and the multiplicity of its entries in a product.
-_ROWS, _COLUMNS = np.triu_indices(6)
-_TIMES = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 
 
 class Poses(NamedTuple):
@@ -59,7 +60,7 @@ class Bound(NamedTuple):
         Information (..., P, 6, 6) with that of fixed anchors.
     spread
         Mean of ``J_n^T J_n`` (P, 6, 6).
-    told
+    candidates
         Upper halves of the information of each candidate alone, (..., P, 21, C).
     """
 
@@ -67,7 +68,7 @@ class Bound(NamedTuple):
     poses: Poses
     prior: FloatArray
     spread: FloatArray
-    told: FloatArray
+    candidates: FloatArray
 
 
 class State(NamedTuple):
@@ -79,14 +80,14 @@ class State(NamedTuple):
         Anchors (..., M, 3).
     score
         Scores (...).
-    promise
+    decrease
         Estimates (..., M, C) of the decrease of the log of the squared score, if an anchor moves
         to a candidate.
     """
 
     points: FloatArray
     score: FloatArray
-    promise: FloatArray
+    decrease: FloatArray
 
 
 def bound_of(seen: Scenery, poses: Poses) -> Bound:
@@ -94,17 +95,17 @@ def bound_of(seen: Scenery, poses: Poses) -> Bound:
     J = bounds.tag_jacobian(poses.rotation, seen.tags)
     spread = np.einsum("pnia,pnib->pab", J, J) / len(seen.tags)
     bound = Bound(seen, poses, poses.prior, spread, _NONE)
-    prior = poses.prior + _told(bound, seen.fixed, poses.fixed_share).sum(axis=-4)
-    told = _packed(_told(bound, seen.candidates, seen.seen)).astype(np.float32)
-    return bound._replace(prior=prior, told=np.moveaxis(told, -3, -1).copy())
+    prior = poses.prior + _of_each(bound, seen.fixed, poses.fixed_share).sum(axis=-4)
+    told = packed(_of_each(bound, seen.candidates, seen.seen)).astype(np.float32)
+    return bound._replace(prior=prior, candidates=np.moveaxis(told, -3, -1).copy())
 
 
-def judged(bound: Bound, points: FloatArray, share: FloatArray) -> State:
+def evaluated(bound: Bound, points: FloatArray, share: FloatArray) -> State:
     """Return the state of layouts (..., M, 3), given information fractions (..., P, M)."""
-    told = _told(bound, points, share)
+    told = _of_each(bound, points, share)
     total = told.sum(axis=-4) + bound.prior
     score = np.sqrt(_square(bound, total))
-    if not bound.told.shape[-1]:
+    if not bound.candidates.shape[-1]:
         return State(points, score, np.zeros((*points.shape[:-1], 0)))
     P = np.linalg.inv(total[..., None, :, :, :] - told)
     K = P @ bound.spread @ P
@@ -112,23 +113,23 @@ def judged(bound: Bound, points: FloatArray, share: FloatArray) -> State:
     # Of each pose, b^2 falls from s to s / (1 + g) with the information, where g s is the
     # derivative: exactly so if one direction dominates. The estimate for the anchor itself is of
     # the same kind.
-    by = (_TIMES * _packed(K) / squares[..., None]).astype(np.float32)
-    gain = np.maximum(np.swapaxes(by, -2, -3) @ bound.told, 0.0)
+    by = (MULTIPLICITY * packed(K) / squares[..., None]).astype(np.float32)
+    gain = np.maximum(np.swapaxes(by, -2, -3) @ bound.candidates, 0.0)
     weighted = bound.poses.weight * squares
     left = np.einsum("...mp,...pmc->...mc", weighted, 1 / (1 + gain))
-    gain = np.maximum(np.einsum("...a,...a->...", by, _packed(told)), 0.0)
+    gain = np.maximum(np.einsum("...a,...a->...", by, packed(told)), 0.0)
     own = (weighted / (1 + gain)).sum(axis=-1, keepdims=True)
     return State(points, score, np.log(own / left))
 
 
-def standing(points: FloatArray, candidates: FloatArray) -> BoolArray:
+def occupied(points: FloatArray, candidates: FloatArray) -> BoolArray:
     """Return the pairs (..., M, C) of which the candidate has an anchor already."""
     there = (points[..., :, None, :] == candidates[..., None, :, :]).all(axis=-1)
     return np.broadcast_to(there.any(axis=-2, keepdims=True), there.shape)
 
 
 def swapped(state: State, candidates: FloatArray, tried: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Return layouts after the most promising swap, and which pair (..., M, C) it is.
+    """Return layouts after the best swap by the estimate, and which pair (..., M, C) it is.
 
     Parameters
     ----------
@@ -139,9 +140,9 @@ def swapped(state: State, candidates: FloatArray, tried: BoolArray) -> tuple[Flo
     tried
         Pairs (..., M, C) that are not tried.
     """
-    promise = np.where(tried, -np.inf, state.promise)
-    flat = promise.reshape(*promise.shape[:-2], -1)
-    pair = (np.arange(flat.shape[-1]) == flat.argmax(axis=-1)[..., None]).reshape(promise.shape)
+    decrease = np.where(tried, -np.inf, state.decrease)
+    flat = decrease.reshape(*decrease.shape[:-2], -1)
+    pair = (np.arange(flat.shape[-1]) == flat.argmax(axis=-1)[..., None]).reshape(decrease.shape)
     moved = pair.any(axis=-1)[..., None]
     return np.where(moved, pair.astype(float) @ candidates, state.points), pair
 
@@ -161,7 +162,7 @@ def _square(bound: Bound, information: FloatArray) -> FloatArray:
     return weighted_square(information, poses.rotation, bound.seen.tags, poses.weight)
 
 
-def _told(bound: Bound, anchors: FloatArray, share: FloatArray) -> FloatArray:
+def _of_each(bound: Bound, anchors: FloatArray, share: FloatArray) -> FloatArray:
     """Return the information (..., M, P, 6, 6) of each anchor alone."""
     places, tags = bound.seen.places[..., None, :, :], bound.seen.tags
     if not anchors.shape[-2]:
@@ -177,8 +178,3 @@ def _told(bound: Bound, anchors: FloatArray, share: FloatArray) -> FloatArray:
         bound.poses.law,
         links,
     )
-
-
-def _packed(matrices: FloatArray) -> FloatArray:
-    """Return the upper halves (..., 21) of matrices (..., 6, 6)."""
-    return matrices[..., _ROWS, _COLUMNS]
