@@ -164,13 +164,14 @@ class Asynchronous:
             twist = check_array("twist", twist, (6,))
         if std_m is not None:
             if noise is not None:
-                raise ValueError("std_m and noise must not both be given: they set the same law")
+                raise ValueError("std_m and noise must not both be given: each sets the noise law")
             noise = LinkNoise(np.array([[check_number("std_m", std_m, low=1e-9)]]))
         if anchors is not None:
             anchors = check_array("anchors", anchors, ("M", 3))
             if anchors.shape[-2] != len(self.anchors):
                 raise ValueError(
-                    f"anchors must hold all {len(self.anchors)} anchors, got shape {anchors.shape}"
+                    f"anchors must have shape ({len(self.anchors)}, 3), as at the start, got "
+                    f"{anchors.shape}"
                 )
         measured = TimedRange(time, anchor, tag, value, twist, noise, anchors)
         newest = max(time, stream.time)
@@ -213,7 +214,9 @@ class Asynchronous:
             return newest.state
         time = check_number("time", time)
         if time < newest.time:
-            raise ValueError(f"time must not lie before the newest range {newest.time}, got {time}")
+            raise ValueError(
+                f"time must not be before the newest range, at {newest.time} s, got {time} s"
+            )
         return self._moved(
             newest, time, None if twist is None else check_array("twist", twist, (6,))
         )

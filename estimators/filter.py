@@ -90,8 +90,10 @@ def register(name: str, factory: Callable[..., Filter]) -> None:
     ValueError
         If another factory already has the name.
     """
-    if not name or not isinstance(name, str) or not callable(factory):
-        raise ValueError(f"name and factory must be a string and a callable, got {name!r}")
+    if not name or not isinstance(name, str):
+        raise ValueError(f"name must be a string, not empty, got {name!r}")
+    if not callable(factory):
+        raise ValueError(f"factory must be callable, got {factory!r:.80}")
     if "/" in name or "," in name:
         raise ValueError(f"name must have no '/' and no ',', got {name!r}")
     if _FACTORIES.setdefault(name, factory) is not factory:

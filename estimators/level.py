@@ -53,7 +53,7 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
         "log_evidence",
     }:
         raise ValueError(
-            "level must be used with a state of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', "
+            "level needs the state of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', "
             f"'iekf-log'), got a state with {', '.join(fields) or type(predicted).__name__}"
         )
     P0, P = before.covariance, predicted.covariance

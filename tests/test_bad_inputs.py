@@ -118,7 +118,7 @@ def test_weights_that_do_not_fit_the_links(name, shape):
     process = motion.ProcessNoise(0.1, 0.1)
     noise = ranging.RangeNoise(0.1)
     filter = estimators.make(name, tags=TAGS, noise=noise, process=process, weights=np.ones(shape))
-    with pytest.raises(ValueError, match=r"weights must fit \(4, 5\) links"):
+    with pytest.raises(ValueError, match=r"weights must fit links \(4, 5\)"):
         filter.update(filter.initial(**GOOD_PRIOR), RANGES, ANCHORS)
 
 

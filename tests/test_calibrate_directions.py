@@ -111,7 +111,7 @@ def test_directions_refuse_what_is_wrong():
     with pytest.raises(ValueError, match="ends"):
         DirectionBasis(ends="anchors")
     nothing = np.zeros((2, 6, 6))
-    with pytest.raises(ValueError, match="must have a link"):
+    with pytest.raises(ValueError, match="must have at least one measured link"):
         fit_directions(nothing, nothing > 0, RING, RING, np.zeros((2, 3, 3)), np.zeros((2, 3)))
 
 

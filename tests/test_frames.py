@@ -158,7 +158,7 @@ def test_one_node_and_two():
     [
         (
             {"known_pair": None},
-            "either known_pair or ranges must be given, for the scale; got neither",
+            "either known_pair or ranges must be given, as one of them sets the scale; got neither",
         ),
         ({"ranges": np.ones(5), "range_std_m": 0.1}, "the scale; got both"),
         ({"length_m": None}, "length_m must be a number"),
@@ -188,7 +188,7 @@ def test_wrong_arguments_are_named(change, message):
 
 def test_the_bound_says_what_is_not_determined():
     positions = np.random.default_rng(0).uniform(size=(4, 2))
-    with pytest.raises(ValueError, match="1 directions have no information"):
+    with pytest.raises(ValueError, match="1 of their unknowns remain free"):
         frame_covariance(positions, SQUARE, 0.1, (0, 1))
-    with pytest.raises(ValueError, match="known_pair must be given"):
+    with pytest.raises(ValueError, match="either known_pair or ranges must be given"):
         frame_covariance(positions, SQUARE, 0.1)

@@ -162,7 +162,7 @@ def test_splines_go_through_poses():
         ),
         (
             lambda: smooth.through([0.0, 0], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), [0]),
-            "strictly increasing",
+            "increase strictly",
         ),
     ],
 )

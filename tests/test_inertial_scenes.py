@@ -215,5 +215,5 @@ def test_a_scene_without_a_sensor_has_nothing_for_the_filter():
         trials.episode.prior_rotation, trials.episode.prior_translation,
         trials.episode.prior_covariance,
     )  # fmt: skip
-    with pytest.raises(ValueError, match="there is none here"):
+    with pytest.raises(ValueError, match="the readings have none"):
         list(track_epochs(filter, prior, readings))

@@ -293,7 +293,7 @@ def test_a_filter_that_cannot_observe_is_a_row_with_its_rank(tmp_path, capsys):
         6,
     )
     table = capsys.readouterr().out
-    assert "kf: does not determine the pose in this scene, rank 8 of 12" in table
+    assert "kf: does not determine the pose in this scene (rank 8 of 12)" in table
     assert "kf, lost-links: refused at epoch 0" in table
 
 

@@ -208,5 +208,5 @@ def test_soft_knowledge_is_honest_and_worth_having():
 def test_level_is_of_iterated_filters():
     filter = estimators.make("kf", tags=TAGS, noise=NOISE, process=STILL)
     state = filter.initial(np.eye(3), np.zeros(3), np.eye(6))
-    with pytest.raises(ValueError, match="level must be used with a state of an iterated EKF"):
+    with pytest.raises(ValueError, match="level needs the state of an iterated EKF"):
         hold_level(state, state, LEVEL)

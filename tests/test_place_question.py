@@ -391,7 +391,7 @@ def test_the_least_number_by_the_command(files, capsys):
     assert failing
     assert place_report.verdict(result).endswith("that passes.")
     assert main([*command, "--fewest"]) == 0
-    assert "with one anchor less" in capsys.readouterr().out
+    assert "with one anchor fewer" in capsys.readouterr().out
 
 
 def test_a_layout_that_survives(files, capsys):

@@ -189,7 +189,7 @@ def test_the_tangent_plane_agrees_with_the_ellipsoid():
         ('{"type": "FeatureCollection", "features": 3}', "'features' must be a list"),
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]}', "feature 0: a Polygon needs 4"),
         ('{"type": "LineString", "coordinates": [[0, "a"], [1, 1]]}', "lists of \\[x, y\\]"),
-        ('{"type": "Blob", "coordinates": []}', "no line that can be read; it contains 1 Blob"),
+        ('{"type": "Blob", "coordinates": []}', "no lines that can be read, only 1 Blob"),
     ],
 )
 def test_bad_geojson_is_named(text, message, tmp_path):

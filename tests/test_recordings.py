@@ -261,14 +261,17 @@ ERRORS = {
         {"calibration": "anchor,tag,bias_m,slope\nA,1,0,-1\n"},
         r"calibration.csv, line 2, column 'slope': must be above -1, got '-1'",
     ),
-    "no links": ({"ranges": "t,aAt1\n0,\n1,\n"}, r"ranges.csv: must have an epoch with a link"),
+    "no links": (
+        {"ranges": "t,aAt1\n0,\n1,\n"},
+        r"ranges.csv: must have at least one usable range",
+    ),
     "no link is valid": (
         {"ranges": "t,anchor,tag,range,valid\n0,A,1,2,0\n"},
-        r"ranges.csv: must have an epoch with a link",
+        r"ranges.csv: must have at least one usable range",
     ),
     "calibrated away": (
         {"ranges": "t,aCt1\n0,3\n", "calibration": CALIBRATION},
-        r"ranges.csv: must have an epoch with a link",
+        r"ranges.csv: must have at least one usable range",
     ),
 }
 

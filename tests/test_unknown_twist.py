@@ -211,7 +211,7 @@ def test_drawn_trajectories_have_the_laws_moments():
             lambda: bounds.posterior_step(
                 np.zeros((12, 12)), EPOCH, bounds.UnknownTwist(np.zeros(6), 0.1, PROCESS, LAW)
             ),
-            "J must be information about all states",
+            "J must be positive definite",
         ),
     ],
 )  # fmt: skip

@@ -110,7 +110,8 @@ class Sb3VecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Not supported: the worlds have no attributes of their own."""
         raise NotImplementedError(
-            "the worlds of a native vector environment have no attributes of their own"
+            f"{attr_name!r} cannot be set: the worlds of a native vector environment share their "
+            "attributes. Pass it to gym.make_vec instead"
         )
 
     def env_method(
@@ -121,7 +122,8 @@ class Sb3VecEnv(VecEnv):
             masks = self.envs.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
             return [masks[i] for i in self._get_indices(indices)]
         raise NotImplementedError(
-            "the worlds of a native vector environment have no methods of their own"
+            f"{method_name!r} cannot be called: the worlds of a native vector environment have no "
+            "methods except action_masks"
         )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:

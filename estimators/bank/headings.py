@@ -273,7 +273,7 @@ def iekf_imu(
         As in `AugmentedEkf`.
     """
     if offset is not None and headings != 1:
-        raise ValueError(f"offset needs headings = 1, got {headings!r}")
+        raise ValueError(f"headings must be 1 if offset is given, got {headings!r}")
     biases = []
     if bias_std_m or common_std_m:
         biases.append(LinkBias(bias_std_m, None, common_std_m))

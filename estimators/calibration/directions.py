@@ -108,7 +108,7 @@ def fit_directions(
     ranges = check_array("ranges", ranges, ("K", "M", "N"))
     mask = np.asarray(links, dtype=bool) & (ranges > 0)
     if not mask.any():
-        raise ValueError("ranges must have a link, got none")
+        raise ValueError("ranges must have at least one measured link, got none")
     rotation, translation, anchors, tags = map(np.asarray, (rotation, translation, anchors, tags))
     u, d = _rays(rotation, translation, anchors, tags)
     e = (ranges - d)[mask]

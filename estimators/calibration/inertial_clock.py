@@ -116,8 +116,8 @@ def inertial_clock(
     windows = _windows(times, readings, float(told.times[0]), _SLOW_S)
     if np.ptp(told.times) < _WINDOW_S or not windows:
         raise ValueError(
-            f"imu and ranges must last {_WINDOW_S:g} s without gaps to estimate the offset: give "
-            "the offset"
+            f"imu and ranges have no {_WINDOW_S:g} s without gaps, so the offset cannot be "
+            "estimated: give the offset"
         )
     arms = np.zeros_like(told.tags)
     path: Any = start
@@ -230,7 +230,7 @@ def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, 
         )
     score = np.where(tried, score, 0.0)
     best = int(np.argmax(score))
-    what = "accelerations of imu and of the track by ranges agree"
+    what = "accelerations of imu and of the track from the ranges agree"
     if score[best] < _LEAST:
         raise ValueError(
             f"{what} at no offset (highest correlation {score[best]:.2f}, at "

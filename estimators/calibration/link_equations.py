@@ -116,7 +116,7 @@ def problem_of(
     mask = ranges > 0 if links is None else check_links(links, ranges.shape)
     assert mask is not None
     if not mask.any():
-        raise ValueError("ranges must have a link, got none")
+        raise ValueError("ranges must have at least one measured link, got none")
     start = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
     link_design, link_prior = _link_design(M, N, model)
     geometry = _geometry_prior(N, model)

@@ -61,10 +61,14 @@ def range_track(
         for name, value in (("times", times), ("ranges", ranges), ("std", std))
     )
     anchors = check_array("anchors", anchors, ("K", 3))
-    if not len(times) == len(ranges) == len(std) == len(anchors) or (np.diff(times) < 0).any():
+    lengths = {len(times), len(ranges), len(std), len(anchors)}
+    if len(lengths) > 1:
         raise ValueError(
-            "times must not decrease, and ranges, std and anchors must have one entry for each time"
+            "times, ranges, std and anchors must have the same length, got "
+            f"{len(times)}, {len(ranges)}, {len(std)} and {len(anchors)}"
         )
+    if (np.diff(times) < 0).any():
+        raise ValueError(f"times must not decrease, got a step of {np.diff(times).min():g} s")
     length = check_number("length of times", float(times[-1] - times[0]), low=2 * _KNOT_S)
     count = int(np.ceil(length / _KNOT_S))
     knots = times[0] + length / count * np.arange(-3, count + 4)

@@ -173,8 +173,8 @@ def _check_count(problem: _Problem) -> None:
     told, unknown = _counts(problem)
     if told < unknown:
         raise ValueError(
-            f"ranges must be at least as many as the unknowns: {told} ranges, {unknown} unknowns "
-            f"({_pose_axes(problem)} of each pose)"
+            f"ranges must be at least as many as the unknowns, got {told} ranges and {unknown} "
+            f"unknowns ({_pose_axes(problem)} for each pose): give a longer log"
         )
 
 

@@ -69,7 +69,9 @@ def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
         spread = (w[:, None] * (body - mean_b)).T @ (sensor - mean_s)
         values = np.linalg.svd(spread, compute_uv=False)
         if values[1] <= 1e-6 * max(values[0], 1e-12):
-            raise ValueError("body must turn about two axes or more to tell how the sensor sits")
+            raise ValueError(
+                "body must turn about at least two axes, or the axes of the sensor stay unknown"
+            )
         R = rotations.nearest(spread)
         bias = mean_s - R.T @ mean_b
         left = body - (sensor - bias) @ R.T

@@ -224,8 +224,8 @@ class AugmentedEkf:
         if have:
             n_tags = self.pose.tags.shape[-2]
             raise ValueError(
-                f"the number of anchors must be {have // len(self.biases) // n_tags}, as the "
-                f"state holds that many biases of each tag, got {shape[0]}"
+                f"the number of anchors must stay {have // len(self.biases) // n_tags}, as the "
+                f"state has a bias of each link, got {shape[0]} anchors"
             )
         return bias_cost.extended(state, *(law.covariance(links) for law in self.biases))
 

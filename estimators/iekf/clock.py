@@ -183,7 +183,7 @@ class ClockEkf(AugmentedEkf):
         if have > first:
             held = self._n_clocks(have)
             raise ValueError(
-                f"the number of anchors must be {held}, the number of clocks in the state, got {n}"
+                f"the number of anchors must stay {held}, as the state has a clock of each, got {n}"
             )
         clocks = np.diag(np.repeat([self.clock.std_m, self.clock.drift_m_s], n) ** 2)
         state = bias_cost.extended(state, *(law.covariance(links) for law in self.biases), clocks)

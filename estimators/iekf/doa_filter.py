@@ -126,7 +126,8 @@ class DoaEkf(IteratedEkf):
             range_law = self.range_noise if range_noise is None else range_noise
             if range_law is None:
                 raise ValueError(
-                    "range_noise must be given, at the filter or in this update, to use ranges"
+                    "range_noise must be given, to the filter or to this update, if there are "
+                    "ranges"
                 )
             anchors = station[..., None, :] if anchors is None else anchors
             ranges, anchors, mask = check_epoch(ranges, anchors, range_links, self.tags)

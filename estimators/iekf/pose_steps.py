@@ -127,6 +127,7 @@ def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArr
     """Return the state of an update, or raise LinAlgError if its covariance is invalid."""
     if not math.isfinite(np.vdot(covariance, covariance)):
         raise np.linalg.LinAlgError(
-            "the information about the pose must stay positive definite in an update"
+            "the information about the pose is not positive definite after the update: check the "
+            "prior covariance, the noise and the ranges"
         )
     return PoseState(rotation, translation, covariance)

@@ -146,8 +146,8 @@ class SurveyedEkf(AugmentedEkf):
             return state
         if have:
             raise ValueError(
-                f"the number of anchors must be {have // 3}, the number of positions in the "
-                f"state, got {anchors}"
+                f"the number of anchors must stay {have // 3}, as the state has a position of "
+                f"each, got {anchors}"
             )
         std = anchor_deviations(self.anchor_std_m, anchors)
         std = np.zeros((anchors, 3)) if std is None else std

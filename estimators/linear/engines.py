@@ -246,9 +246,13 @@ class FilterPy:
     def _result(kf: Any) -> tuple[FloatArray, FloatArray]:
         mean, P = np.asarray(kf.x), np.asarray(kf.P)
         if mean.shape != (12, 1) or P.shape != (12, 12):
-            raise RuntimeError(f"filterpy returned shapes {mean.shape} and {P.shape}")
+            raise RuntimeError(
+                f"filterpy must return mean (12, 1) and P (12, 12), got {mean.shape}, {P.shape}"
+            )
         if not math.isfinite(np.vdot(mean, mean) + np.vdot(P, P)):
-            raise ValueError("the filter's state is no longer finite")
+            raise ValueError(
+                "the state of the filter is not finite: check the prior, noise and ranges"
+            )
         return mean[:, 0], symmetric(P)
 
 

@@ -204,7 +204,9 @@ class KalmanFamily:
                 1,
                 self.tags.shape[-2],
             ):
-                raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
+                raise ValueError(
+                    f"weights must fit links {ranges.shape[-2:]}, got shape {weights.shape}"
+                )
         if state.mean.ndim > 1 or ranges.ndim > 2:
             check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
         if mask is not None:

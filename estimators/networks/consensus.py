@@ -94,8 +94,8 @@ def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
     low = sp.linalg.eigsh(F, k=1, sigma=-1e-6, v0=start, return_eigenvectors=False)
     if low[0] <= _ZERO * high[0]:
         raise ValueError(
-            f"cycles must be independent where they are more than {_DENSE}, "
-            f"got {C.shape[0]} dependent ones"
+            f"more than {_DENSE} cycles must be linearly independent, got {C.shape[0]} "
+            "dependent cycles: use cycles='bfs'"
         )
     return float(low[0]), float(high[0])
 
@@ -201,8 +201,8 @@ def _least_norm_columns(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
                 return C.T @ factors.solve(off)
     if min(C.shape) > _DENSE:
         raise ValueError(
-            f"cycles must be independent where they are more than {_DENSE}, "
-            f"got {C.shape[0]} dependent ones"
+            f"more than {_DENSE} cycles must be linearly independent, got {C.shape[0]} "
+            "dependent cycles: use cycles='bfs'"
         )
     return np.linalg.lstsq(C.toarray(), off, rcond=_ZERO)[0]
 

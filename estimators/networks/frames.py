@@ -114,7 +114,7 @@ def _measured(
         raise ValueError(f"ranges must not be negative, got {lengths.min()}")
     if (known is None) == (not lengths.any()) and n_nodes > 1:
         raise ValueError(
-            "either known_pair or ranges must be given, for the scale; got "
+            "either known_pair or ranges must be given, as one of them sets the scale; got "
             + ("neither" if known is None else "both")
         )
     std = 1.0

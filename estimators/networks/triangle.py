@@ -58,7 +58,9 @@ def triangle_frames(bearings: ArrayLike, length_m: float = 1.0) -> TriangleFrame
     normal = np.cross(ahead, behind)
     sine = np.linalg.norm(normal, axis=-1)
     if (sine < _SMALLEST_SINE).any():
-        raise ValueError("bearings must span a triangle, got a node with both others on one line")
+        raise ValueError(
+            "bearings must span a triangle, got a node that sees both others on one line"
+        )
     normal /= sine[..., None]
     measured = np.arctan2(sine, (ahead * behind).sum(axis=-1))
     misfit = np.pi - measured.sum(axis=-1)

@@ -221,7 +221,10 @@ def smooth(
     covariances = equations.covariances()
     P, _, constants = covariances
     if not np.isfinite(P).all():
-        raise ValueError("log and prior must determine every state, but some have no information")
+        raise ValueError(
+            "log and prior must determine every state, but some have no information: give a "
+            "finite prior covariance, or more ranges"
+        )
     squares, freedom = problem.ranges.consistency(state, losses[-1], covariances)
     if model.motion.turning:
         P = _of_errors(P, state)
@@ -331,7 +334,7 @@ def _checked(
     """Check the arguments; return the problem and its initial state."""
     times = check_array("times", log.times, ("K",))
     if (np.diff(times) < 0).any():
-        raise ValueError("times must not decrease")
+        raise ValueError(f"times must not decrease, got a step of {np.diff(times).min():g} s")
     if model.offset is None:
         signed = model.clock is not None
         epoch = log.ranges, log.anchors, log.links, model.tags

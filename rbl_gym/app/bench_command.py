@@ -35,26 +35,34 @@ def add_bench(commands: Any) -> None:
         "--filters",
         type=names,
         metavar="A,B",
-        help=f"{FILTER_HELP}; default: all except iekf-bank, iekf-bias, iekf-cv, iekf-imu and "
-        "iekf-log; plus iekf/robust=true, and for each scene the filters made for it",
+        help=f"{FILTER_HELP}. Default: all filters except iekf-bank, iekf-bias, iekf-cv, iekf-imu "
+        "and iekf-log; also iekf/robust=true, and the filters made for each scene",
     )
     bench.add_argument(
         "--scenes",
         type=names,
         metavar="A,B",
-        help="scenes: a name, or a .toml or .json file with a changed scene or a recording; "
-        "default: all named scenes, and those with an inertial sensor, time differences or "
-        "surveyed anchors",
+        help="names of scenes, or .toml or .json files, each with a changed scene or a recording; "
+        "default: all named scenes, and the scenes with an inertial sensor, with time differences "
+        "and with surveyed anchors",
     )
-    bench.add_argument("--conditions", type=names, metavar="A,B", help="conditions, default all")
+    bench.add_argument(
+        "--conditions",
+        type=names,
+        metavar="A,B",
+        help="nominal, nlos, lost-links, noise-x2, anchor-off, tag-off (docs/leaderboard.md); "
+        "default all",
+    )
     add_trials(bench, 200)
     bench.add_argument(
         "--out",
         default="out/bench.jsonl",
         metavar="F",
-        help="file of the records, one on each line; default out/bench.jsonl",
+        help="file for the results of the runs, one on each line; default out/bench.jsonl",
     )
-    bench.add_argument("--fresh", action="store_true", help="drop the records that F already has")
+    bench.add_argument(
+        "--fresh", action="store_true", help="delete the results that the file of --out already has"
+    )
     add_html(bench, "page with maps and a sortable table")
     _add_workers(bench)
     add_json(bench)
@@ -70,7 +78,7 @@ def add_rerun(commands: Any) -> None:
             "Repeat all runs of a file of rbl-gym bench. The exit status is 1 if a result differs."
         ),
     )
-    rerun.add_argument("file", metavar="FILE", help="records, written by rbl-gym bench")
+    rerun.add_argument("file", metavar="FILE", help="results, written by rbl-gym bench --out FILE")
     _add_workers(rerun)
     add_json(rerun)
     rerun.set_defaults(run=_rerun)

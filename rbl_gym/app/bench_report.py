@@ -41,8 +41,8 @@ def print_bench(result: dict[str, Any]) -> None:
         console.print(f"{name}: {result['conditions'][name]}")
     console.print(
         "Root mean squares over trials and epochs; median, p95 and the columns after them are of "
-        "the tag error.\nANEES: per degree of freedom, 1 is consistent; + optimistic, - "
-        "pessimistic. Stress: tag RMSE (m), then ANEES, then trials lost."
+        "the tag error.\nANEES per degree of freedom: 1 is consistent, + marks an optimistic and "
+        "- a pessimistic filter.\nTables of stress: tag RMSE (m), then ANEES, then trials lost."
     )
 
 
@@ -121,8 +121,8 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
     lines = []
     if first["status"] == "unobservable":
         lines.append(
-            f"{name}: does not determine the pose in this scene, rank {first['rank']} of "
-            f"{first['states']}: it depends on its prior"
+            f"{name}: does not determine the pose in this scene (rank {first['rank']} of "
+            f"{first['states']}); its result depends on its prior"
         )
     for condition, row in conditions.items():
         if row["message"]:
@@ -130,8 +130,8 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
     rates = [rate for row in conditions.values() if (rate := row.get("trigger_rate")) is not None]
     if any(0 < rate < 1 for rate in rates):
         lines.append(
-            f"{name}: triggered at {100 * rates[0]:.0f} % of the updates, in the worst condition "
-            f"at {100 * max(rates):.0f} %"
+            f"{name}: projects after {100 * rates[0]:.0f} % of the updates, in the worst condition "
+            f"after {100 * max(rates):.0f} %"
         )
     return lines
 

@@ -15,19 +15,16 @@ def add_bounds(commands: Any) -> None:
     """Add the parser of ``rbl-gym bounds``."""
     bounds = commands.add_parser(
         "bounds",
-        help="accuracy bounds with better sensors, surveys and calibrations",
-        description="Compute posterior Cramer-Rao bounds along a track of a scene, for several "
-        "sources of the motion (ranges alone, a known twist, inertial sensors) and several "
-        "unknowns (anchor positions to 1, 3 and 10 cm, biases of the links, offsets of the tags). "
-        "No filter is run. See docs/hard_conditions.md.",
+        help="accuracy bounds of a scene with other sensors, anchor surveys and calibrations",
+        description="Compute posterior Cramer-Rao bounds along tracks of a scene. One column for "
+        "each source of the motion: ranges alone, a known twist, inertial sensors. One row for "
+        "each unknown besides the pose: anchor positions (known to 1, 3 and 10 cm), biases of the "
+        "links, offsets of the tags. No filter is run. See docs/hard_conditions.md.",
     )
     bounds.add_argument(
         "--scene",
         default="uwb_room",
-        help=(
-            "name of a scene, or a .toml or .json file with a changed scene, as for bench; "
-            "default uwb_room"
-        ),
+        help="name of a scene, or a .toml or .json file with a changed scene; default uwb_room",
     )
     add_trials(bounds, 20)
     add_json(bounds)
@@ -41,7 +38,8 @@ def _bounds(options: argparse.Namespace) -> int:
     spec = next(iter(spec_files.scene_specs([options.scene]).values()))
     if isinstance(spec, dict) and "ranges" in spec:
         raise ValueError(
-            f"{Path(options.scene)}: must be a scene, got a recording, for which there is no bound"
+            f"{Path(options.scene)}: must be a scene, got a recording: a bound needs the true "
+            "poses and noise of a scene"
         )
     with progress("bounds") as advance:
         result = what_if.what_if(spec, options.trials, options.seed, advance)
@@ -60,7 +58,7 @@ def _print(result: dict[str, Any]) -> None:
         table = new_table(
             f"{result['scene']}: bound of {label}, {result['epochs']} epochs, {result['trials']} "
             "trials; in brackets: the second half of the epochs",
-            ["not known"],
+            ["unknown besides the pose"],
             motions,
         )
         for unknown in unknowns:
@@ -73,7 +71,8 @@ def _print(result: dict[str, Any]) -> None:
     law = result["uncalibrated"]
     console.print(
         "One sigma of all three axes together, root mean square over trials and epochs. Ranges "
-        "alone: the motion is known only by a law of the accelerations. Biases of links: "
-        f"constant, {100 * law['std_m']:g} cm for each link and {100 * law['common_std_m']:g} cm "
-        "common to all. Biases and anchor positions are estimated along with the pose."
+        "alone: of the motion only the distribution of the accelerations is known. Biases of "
+        f"links are constant: {100 * law['std_m']:g} cm for each link and "
+        f"{100 * law['common_std_m']:g} cm common to all (one sigma). Biases and anchor positions "
+        "are estimated together with the pose."
     )

@@ -46,22 +46,23 @@ def _add_links(group: Any) -> None:
         "--model",
         dest="biases",
         choices=("auto", "link", "node", "common"),
-        help="one bias for each link, for each anchor and tag (antenna delays), or for all links; "
-        "default auto: for links if they have enough ranges, else for nodes",
+        help="link: one bias for each link; node: one for each anchor and each tag (antenna "
+        "delays); common: one for all links; auto (default): link if each link has enough ranges, "
+        "else node",
     )
     group.add_argument(
         "--no-slopes",
         dest="slopes",
         action="store_false",
         default=None,
-        help="no scale errors: ranges grow by as much as distances",
+        help="estimate no scale errors of the ranges",
     )
     group.add_argument(
         "--arms",
         dest="tags_model",
         choices=("held", "turned", "free"),
-        help="held: the table of tags is exact; turned: it is turned and shifted as a whole "
-        "(default); free: every tag position is estimated",
+        help="positions of the tags. held: the table is exact; turned (default): a turn and a "
+        "shift of the whole table are estimated; free: every position is estimated",
     )
 
 
@@ -70,15 +71,16 @@ def _add_directions(group: Any) -> None:
         "--harmonics",
         type=int,
         metavar="N",
-        help="bias by the direction in which a ray leaves the body: largest number of harmonics "
-        "of its bearing; cross-validation chooses the number; default 0, none",
+        help="estimate a bias that depends on the direction of the ray in the body frame, a "
+        "Fourier series of its bearing with at most N harmonics; cross-validation chooses the "
+        "number; default 0: no such bias",
     )
     group.add_argument(
         "--ends",
         choices=("tags", "both"),
         help=(
-            "tags: directions at the tags (default); both: at the anchors too, if they are "
-            "on a body"
+            "bias of --harmonics by the direction at the tags (default), or at both ends, if "
+            "the anchors are on a body too"
         ),
     )
 
@@ -131,8 +133,8 @@ def _add_anchors(group: Any) -> None:
         "--start",
         choices=("table", "ranges"),
         help=(
-            "table: the positions in --anchors are rough (default); ranges: nothing is known "
-            "of them"
+            "table (default): start from the rough positions in --anchors; ranges: start from "
+            "the ranges alone"
         ),
     )
     group.add_argument(

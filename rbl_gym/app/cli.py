@@ -75,7 +75,9 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="rbl-gym", description="Localization of rigid bodies by radio."
+        prog="rbl-gym",
+        description="Localization of rigid bodies by radio. Help for a command: rbl-gym COMMAND "
+        "--help.",
     )
     parser.add_argument("--version", action="version", version=f"rbl-gym {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command")

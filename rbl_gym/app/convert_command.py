@@ -21,7 +21,7 @@ def add_convert(commands: Any) -> None:
     """Add the parser of ``rbl-gym convert``."""
     convert = commands.add_parser(
         "convert",
-        help="convert a ROS 1 or ROS 2 bag, or an MCAP file, to files for replay",
+        help="convert a ROS 1 or ROS 2 bag, or an MCAP file, to the files that replay reads",
         description="Write ranges.csv, and anchors, tags, truth, imu and odometry if the log has "
         "them. Known message types need no option; see docs/bags.md.",
     )
@@ -29,20 +29,22 @@ def add_convert(commands: Any) -> None:
         "log",
         nargs="+",
         metavar="LOG",
-        help="one or several x.bag, the folder of a ROS 2 bag, x.db3 or x.mcap",
+        help="a .bag, .db3 or .mcap file (several are read as one log), or the folder of a ROS 2 "
+        "bag",
     )
-    convert.add_argument("--out", metavar="DIR", help="folder for the files")
+    convert.add_argument("--out", metavar="DIR", help="folder for the written files")
     convert.add_argument(
         "--list",
         nargs="?",
         const="",
         metavar="TOPIC",
-        help="show the topics, or the fields of a topic, and write nothing",
+        help="show the topics of the log, or the fields of TOPIC, and write nothing",
     )
     convert.add_argument(
         "--map",
         metavar="F",
-        help="TOML file with the options below as tables: ranges, truth, imu, odometry",
+        help="TOML file with the tables ranges, truth, imu and odometry, in place of the options "
+        "below",
     )
     for kind, text in _KINDS.items():
         convert.add_argument(

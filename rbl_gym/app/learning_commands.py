@@ -28,7 +28,8 @@ def add_train(commands: Any) -> None:
     train = commands.add_parser(
         "train",
         help="train a policy (needs the extra rl)",
-        description="Train a policy on a task. The same seed gives the same policy.",
+        description="Train a policy on a task. The same seed gives the same policy. See "
+        "docs/learning.md for the tasks.",
     )
     train.add_argument("task", choices=sorted(TASKS))
     _add_worlds(train)
@@ -52,11 +53,11 @@ def add_evaluate(commands: Any) -> None:
     """Add the parser of ``rbl-gym evaluate``."""
     evaluate = commands.add_parser(
         "evaluate",
-        help="score policies and references on held-out worlds",
-        description="Score policies against the references on held-out worlds, with 95 % "
-        "intervals of the paired bootstrap.",
+        help="compare policies with reference methods on held-out worlds",
+        description="Score policies and reference methods (random, greedy, ...) on held-out "
+        "worlds, with 95 % intervals of the paired bootstrap. See docs/learning.md.",
     )
-    _add_players(evaluate, list(TASKS), worlds=_WORLDS, references="all of the task")
+    _add_players(evaluate, list(TASKS), worlds=_WORLDS, references="all that the task has")
     add_json(evaluate)
     evaluate.set_defaults(run=_evaluate)
 
@@ -65,12 +66,15 @@ def add_transfer(commands: Any) -> None:
     """Add the parser of ``rbl-gym transfer``."""
     transfer = commands.add_parser(
         "transfer",
-        help="check layouts and policies by tracking bodies with filters",
-        description="Track moving bodies with several filters, among anchors placed, moved or "
-        "selected by policies and references. This checks whether a good score means a small "
-        "error.",
+        help="check the scores of policies by tracking bodies with filters",
+        description="Let policies and reference methods place, move or select anchors. Track "
+        "moving bodies with several filters among these anchors. This checks whether a good score "
+        "means a small error. See docs/learning.md.",
     )
-    defaults = "random, ring, greedy-swaps, hybrid; or random, orbit; or random, nearest, greedy"
+    defaults = (
+        "random, ring, greedy-swaps and hybrid for placement; random and orbit for moving anchors; "
+        "all for selection"
+    )
     _add_players(transfer, list(TASKS), worlds=48, references=defaults)
     transfer.add_argument(
         "--repeats",
@@ -86,12 +90,15 @@ def _add_worlds(parser: argparse.ArgumentParser) -> None:
     """Add options for the worlds of the task."""
     worlds = parser.add_mutually_exclusive_group()
     worlds.add_argument(
-        "--scene", metavar="NAME|F", help="another scene: a name, or a JSON or TOML file"
+        "--scene",
+        metavar="NAME|F",
+        help="a scene in place of that of the task: a name, or a JSON or TOML file",
     )
     worlds.add_argument(
         "--scenes",
         metavar="F",
-        help="JSON or TOML file with scenes to draw from: a list, or one scene with laws",
+        help="JSON or TOML file with scenes, of which each world draws one: a list, or a scene "
+        "whose values are ranges to draw from",
     )
 
 
@@ -122,7 +129,9 @@ def _add_players(
         metavar="F",
         help="file of a policy, from rbl-gym train; may be given several times",
     )
-    parser.add_argument("--references", metavar="A,B", help=f"references, default {references}")
+    parser.add_argument(
+        "--references", metavar="A,B", help=f"reference methods; default: {references}"
+    )
     parser.add_argument(
         "--worlds", type=positive, default=worlds, help=f"number of worlds, default {worlds}"
     )

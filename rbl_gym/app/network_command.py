@@ -26,7 +26,9 @@ def add_network(commands: Any) -> None:
         default="information",
         help="weights of the edges: information of theta in the file (default), or equal weights",
     )
-    network.add_argument("--plot", metavar="F", help="picture of the graph and the residuals")
+    network.add_argument(
+        "--plot", metavar="F", help="picture of the graph and of the residuals of its edges"
+    )
     add_json(network)
     network.set_defaults(run=_network)
 

@@ -20,10 +20,10 @@ def add_demo(commands: Any) -> None:
     """Add the parser of ``rbl-gym demo``."""
     demo = commands.add_parser(
         "demo",
-        help="compare five filters with the bound: the experiment of the tracking paper",
+        help="compare five filters with the Cramer-Rao bound in simulation",
         description=(
-            "Track a rigid body in Monte Carlo trials (CAMSAP 2013); print a table and draw "
-            "a picture."
+            "Track a rigid body with five filters in Monte Carlo trials (the experiment of the "
+            "tracking paper, CAMSAP 2013). Print a table and draw a picture."
         ),
     )
     add_trials(demo)
@@ -72,7 +72,7 @@ def add_reproduce(commands: Any) -> None:
     network.add_argument(
         "--positions",
         metavar="F",
-        help="CSV file of fixed points with the header x,y, the reference first",
+        help="CSV file of the nodes with the header x,y; the first is the reference",
     )
     network.add_argument(
         "--footprint",
@@ -86,7 +86,7 @@ def add_reproduce(commands: Any) -> None:
         "--variance",
         metavar="S2",
         type=float,
-        help="variance of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01",
+        help="variance of a bearing, rad^2; default 0.1, and 0.01 in Figs 5 and 6",
     )
     add_json(reproduce)
     reproduce.set_defaults(run=_reproduce)

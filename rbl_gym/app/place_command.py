@@ -52,7 +52,7 @@ def add_place(commands: Any) -> None:
     place.add_argument(
         "--fewest",
         action="store_true",
-        help="the least number that meets the requirements of all zones",
+        help="find the least number of anchors that meets the requirements of all zones",
     )
     place.add_argument(
         "--survive",

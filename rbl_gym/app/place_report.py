@@ -73,11 +73,11 @@ def notes(result: dict[str, Any]) -> list[str]:
     criteria, check = result["criteria"], result["check"]
     conditioning = criteria["conditioning"]
     found = [
-        "A place is within the requirement if one sigma of the pose from one epoch of ranges "
-        "(root mean square over rotations of the body) is at most each limit: horizontal "
-        "position, height, heading. The interval (95 %) is due to the sampling of places; a zone "
-        "passes if the whole interval is above the required share. Margin: limit over the error "
-        "at the required share.",
+        "A place meets the requirement if the errors of horizontal position, height and heading "
+        "are within their limits. An error is one sigma, from one epoch of ranges (root mean "
+        "square over rotations of the body). The interval (95 %) is due to the sampling of places; "
+        "a zone passes if the whole interval is above the required share. Margin: limit over the "
+        "error at the required share.",
         "Predicted: Cramer-Rao bound of all three axes together; b is the root mean square tag "
         "error.",
         f"Criteria: position {criteria['position_m']:.4g} m, rotation "
@@ -195,7 +195,7 @@ def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
         "zone", "verdict", "within", "95 % interval", "required", "margin",
         "would pass: position (m)", "height (m)", "heading (deg)", "all times",
     ]  # fmt: skip
-    yield Rows(f"with one anchor less, {less['n_anchors']}", headings, rows)
+    yield Rows(f"with one anchor fewer, {less['n_anchors']}", headings, rows)
 
 
 def _anchors(result: dict[str, Any]) -> Rows:
@@ -208,7 +208,7 @@ def _anchors(result: dict[str, Any]) -> Rows:
         ]
         for anchor in result["anchors"]
     ]
-    headings = ["anchor", "x (m)", "y (m)", "z (m)", "mount", "sees of the zones"]
+    headings = ["anchor", "x (m)", "y (m)", "z (m)", "mount", "sees (share of the zones)"]
     return Rows("anchors", headings, rows)
 
 

@@ -15,13 +15,14 @@ if TYPE_CHECKING:
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _HELP = {
-    "walls": "lines that weaken links: material=concrete, thickness_m=0.2, side_by_side_m=0.4 "
-    "(drawn as two lines)",
+    "walls": "lines that weaken links: material, as in material=concrete, thickness_m, "
+    "side_by_side_m (largest distance of two lines that are one wall)",
     "obstacles": "areas that weaken links and where the body cannot be: material, low_m, high_m",
-    "zones": "where the body works: name, low_m, high_m, position_m=0.1, heading_deg, share",
-    "mounts": "where anchors may stand: kind=wall, ceiling, column, area or points; low_m, high_m, "
-    "height_m, side, cost",
-    "forbidden": "areas where anchors may not stand",
+    "zones": "areas where the body works, and what they require: name, low_m, high_m, position_m, "
+    "heading_deg, share",
+    "mounts": "where anchors may be mounted: kind (wall, ceiling, column, area or points), low_m, "
+    "high_m, height_m, side, cost",
+    "forbidden": "areas where no anchor may be mounted",
     "fixed": "points of fixed anchors: height_m",
 }
 
@@ -30,10 +31,10 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     """Add the options about a drawing or a picture."""
     plan = parser.add_argument_group(
         "floor plan",
-        "A drawing (.dxf, .geojson) or a picture (.png, .jpg). The options assign the layers of "
-        "a drawing, by LAYER,KEY=VALUE,...; * in LAYER matches any letters. Each option may be "
-        "given several times. Without options, layers named walls, zones, ... are assigned by "
-        "their names.",
+        "For a drawing (.dxf, .geojson) or a picture (.png, .jpg). Each of the first six options "
+        "says what a layer of a drawing is, as LAYER,KEY=VALUE,...; * in LAYER matches any "
+        "letters; each may be given several times. Without them, the names of the layers (walls, "
+        "zones, ...) decide. The keys are listed after the colon.",
     )
     for kind, text in _HELP.items():
         plan.add_argument(f"--{kind}", action="append", default=[], metavar="LAYER", help=text)
@@ -57,9 +58,11 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
         help="height of the room, metres, default 3",
     )
     plan.add_argument(
-        "--picture", metavar="F", help="background picture of the drawing or the building file"
+        "--picture", metavar="F", help="picture to show behind the drawing or the building"
     )
-    plan.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the picture")
+    plan.add_argument(
+        "--metres-per-pixel", type=float, metavar="M", help="scale of the picture, metres"
+    )
     plan.add_argument(
         "--width",
         type=float,
@@ -130,7 +133,7 @@ def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
             problem = dataclasses.replace(problem, plan=plan._replace(**picture(options)))
         return problem
     if options.racks:
-        raise ValueError(f"racks must be 0 with a plan, got {options.racks}")
+        raise ValueError(f"--racks must be left out with a plan, got {options.racks}")
     plan = read_plan(path, options, n_anchors)
     for line in plan.said:
         print(f"{path}: {line}", file=sys.stderr)

@@ -70,17 +70,17 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
         type=_pairs,
         action="append",
         metavar="WHAT=NAME,...",
-        help="names of the columns: time=time_s,anchor=to_id,range=dist; in another file "
-        "truth.x=px, anchors.anchor=name; one column for each link "
-        "range=r_{anchor}_{tag},std=sd_{anchor}_{tag}; with a prefix truth.*=B_*; numbers if "
-        "there is no header, odometry.t=1; may be given several times",
+        help="names of columns in your files. In --ranges: time=time_s,anchor=to_id,range=dist. In "
+        "another file: truth.x=px. All columns with a prefix: truth.*=B_*. One column for each "
+        "link: range=r_{anchor}_{tag},std=sd_{anchor}_{tag}. Without a header, numbers from 1: "
+        "odometry.t=1. May be given several times",
     )
     reading.add_argument(
         "--where",
         type=_pairs,
         action="append",
         metavar="COLUMN=CELL,...",
-        help="rows to read: anchors.agent=1,tags.agent=2",
+        help="read only the rows whose COLUMN has this cell, as in anchors.agent=1,tags.agent=2",
     )
     reading.add_argument(
         "--time-unit",
@@ -113,7 +113,7 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
         "--run",
         dest="which_run",
         metavar="NAME",
-        help="name of the run to read, if there are several",
+        help="name of the run to read, if the file has several",
     )
     reading.add_argument(
         "--relative",
@@ -123,7 +123,7 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
     reading.add_argument(
         "--strict",
         action="store_true",
-        help="stop with an error at data that are otherwise dropped or sorted",
+        help="stop with an error at rows that are otherwise dropped or sorted",
     )
 
 

@@ -59,7 +59,7 @@ def _add_knowledge(group: Any) -> None:
         "--planar",
         action="store_true",
         default=None,
-        help="the body moves in a plane: height, roll and pitch are held",
+        help="the body moves in a level plane: height, roll and pitch stay constant",
     )
     _add_numbers(group, (
         ("height-offset-m", "with --planar: depth of the tags below the anchors (difference of "
@@ -101,9 +101,9 @@ def _add_filter(group: Any) -> None:
     group.add_argument(
         "--filter",
         metavar="NAME",
-        help=f"{FILTER_HELP}; default iekf-log, but iekf with --walk-..., iekf-bias with --raw or "
-        "--bias-..., iekf-imu with --imu; default of robust: late for iekf-log and iekf-imu, "
-        "else true",
+        help=f"{FILTER_HELP}. Default: iekf-log; iekf with --walk-...; iekf-bias with --raw or "
+        "--bias-...; iekf-imu with --imu. Default of its option robust: late for iekf-log and "
+        "iekf-imu, else true",
     )
     _add_numbers(group, (
         ("range-std-m", "standard deviation of a range, metres; default: that of the recording, "
@@ -117,11 +117,12 @@ def _add_filter(group: Any) -> None:
 
 def _add_motion(group: Any) -> None:
     _add_numbers(group, (
-        ("walk-m", "random walk of the position: deviation after 1 s, metres, default 0.1"),
-        ("walk-deg", "random walk of the rotation: deviation after 1 s, degrees, default "
+        ("walk-m", "random walk of the position: standard deviation after 1 s, metres, default "
+         "0.1"),
+        ("walk-deg", "random walk of the rotation: standard deviation after 1 s, degrees, default "
          "7"),
         ("accel-m", "iekf-log, iekf-cv: standard deviation of the change of speed after 1 s, m/s; "
-         "default 1 and 0.5"),
+         "default 1 for iekf-log, 0.5 for iekf-cv"),
         ("accel-deg", "iekf-log, iekf-cv: standard deviation of the change of turn rate after 1 "
          "s, deg/s; default 30"),
     ))  # fmt: skip

@@ -22,10 +22,11 @@ CAMSAP_COLUMNS = (
 
 # Our column alone, if a source has neither a table nor a claim in words.
 _NO_NUMBERS = {
-    "icassp2013": "The paper prints no numbers. Its Figs 2 and 3 are angle and translation over\n"
-    "the reference range, settings with 1 mm their parts (b). CLS and CTLS have one solution "
-    "(Lemma 2).",
-    "slides2013": "The slides print no numbers and no parameters: those are of the two papers.",
+    "icassp2013": "The paper prints no numbers. Its Figs 2 and 3 show the errors of angle\n"
+    "and translation against the reference range; their parts (b) are the settings with 1 mm. "
+    "CLS and CTLS have the same solution (Lemma 2).",
+    "slides2013": "The slides print no numbers and no parameters. The parameters are those of the\n"
+    "two papers.",
 }
 
 

@@ -23,9 +23,13 @@ def add_odometry(group: Any) -> None:
             "odometry-m",
             "standard deviation of the forward distance after 1 s, metres, default 0.05",
         ),
-        ("slip-m", "the same sideways and vertically, metres, default 0.03"),
+        (
+            "slip-m",
+            "standard deviation of the sideways and vertical distance after 1 s, metres, "
+            "default 0.03",
+        ),
         ("odometry-deg", "standard deviation of the turn after 1 s, degrees, default 6"),
-        ("odometry-scale", "standard deviation of the scale errors, default 0.03"),
+        ("odometry-scale", "standard deviation of the scale errors (0.03: 3 %%), default 0.03"),
         (
             "odometry-bias-deg-s",
             "standard deviation of the biases of the turn rates, deg/s, default 0.5",
@@ -47,7 +51,10 @@ def add_inertial(group: Any) -> None:
             "gyro-noise",
             "density of the white noise of the gyroscope, rad/s/sqrt(Hz), default 0.003",
         ),
-        ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.05"),
+        (
+            "accel-noise",
+            "density of the white noise of the accelerometer, m/s^2/sqrt(Hz), default 0.05",
+        ),
         (
             "gravity-tilt-deg",
             "standard deviation of the tilt of the world's z axis against the vertical, degrees, "
@@ -55,7 +62,8 @@ def add_inertial(group: Any) -> None:
         ),
         (
             "recorded-share",
-            "share of the standard deviations in the log that is noise, default 0.5",
+            "share of the range deviations in the log that is white noise, default 0.5; the "
+            "rest is constant biases",
         ),
     ):
         group.add_argument(f"--{name}", type=float, metavar="X", help=text)
@@ -69,9 +77,9 @@ def add_clocks(group: Any) -> None:
         action="append",
         dest="time_offsets",
         metavar="[WHAT=]S",
-        help="how far the clock of the truth is ahead of the clock of the ranges, seconds; auto: "
-        "estimated from the motion. odometry=S and imu=S: the same for these clocks; "
-        "odometry=auto: estimated by the likelihood of the ranges, up to 2.4 s; imu=auto: "
+        help="S: how far the clock of the truth is ahead of the clock of the ranges, seconds; "
+        "auto: estimated from the motion. odometry=S, imu=S: how far these clocks are ahead; "
+        "odometry=auto: estimated from the likelihood of the ranges, up to 2.4 s; imu=auto: "
         "estimated from accelerations, up to 10 s. May be given several times",
     )
 

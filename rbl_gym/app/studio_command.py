@@ -16,11 +16,11 @@ def add_studio(commands: Any) -> None:
     """Add the parser of ``rbl-gym studio``."""
     studio = commands.add_parser(
         "studio",
-        help="drag anchors or watch filters on a page in the browser",
+        help="drag anchors, or watch filters, on a page in the browser",
         description="Open a page in the browser. On it you drag anchors, and a map of the accuracy "
         "follows. With --watch, --env or --ranges the page shows filters that track a body. "
-        "Everybody who can open the page can change the layout and save files into the "
-        "folder.",
+        "Everybody who can open the page can change the layout and save files into "
+        "--folder.",
     )
     studio.add_argument(
         "scene",
@@ -60,7 +60,9 @@ def add_studio(commands: Any) -> None:
     watch = studio.add_argument_group("watching filters")
     watch.add_argument("--watch", action="store_true", help="show an episode of SCENE|FILE")
     watch.add_argument(
-        "--env", metavar="ID", help="show an episode of an environment, as RBL/AnchorSelection-v0"
+        "--env",
+        metavar="ID",
+        help="show an episode of an environment, such as RBL/AnchorSelection-v0",
     )
     watch.add_argument(
         "--policy",
@@ -80,8 +82,8 @@ def add_studio(commands: Any) -> None:
         type=names,
         default=[],
         metavar="A,B",
-        help=f"one or several filters, shown side by side: {FILTER_HELP}; default "
-        "iekf,iekf/robust=true, for a recording iekf-log",
+        help=f"one or several filters, shown side by side: {FILTER_HELP}. Default: "
+        "iekf,iekf/robust=true; for a recording iekf-log",
     )
     add_plan_options(studio)
     add_reading(studio, left_out=("anchors",))
@@ -128,7 +130,10 @@ def _studio(options: argparse.Namespace) -> int:
 
 def _check_scene(options: argparse.Namespace) -> None:
     if options.scene is None:
-        raise ValueError("SCENE|FILE must be given: a named scene as uwb_room, or a building file")
+        raise ValueError(
+            "SCENE|FILE must be given: a named scene, as in rbl-gym studio uwb_room, or a building "
+            "file"
+        )
     if isinstance(options.anchors, str):
         raise ValueError(f"--anchors must be a number without --ranges, got {options.anchors!r}")
 
@@ -175,7 +180,7 @@ def _learned(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
 
     if options.env:
         if options.reference:
-            raise ValueError("--reference must be left out with --env, it is for the tasks")
+            raise ValueError("--reference must be left out with --env: only tasks have references")
         env = _env(options)
         return learned.played_program(options.policy, env, labels or None, options.seed)
     scene = read_scene(options.scene) if options.scene else None

@@ -16,8 +16,8 @@ from rbl_gym.studies.extras import require
 from rbl_gym.studies.progress import Advance
 
 FILTER_HELP = (
-    "NAME, NAME/option=value/option=value or MODULE:FACTORY (docs/estimators.md, Filters with "
-    "options)"
+    "NAME, NAME/option=value/option=value or MODULE:FACTORY (see Filters with options in "
+    "docs/estimators.md)"
 )
 
 
@@ -28,7 +28,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="-",
         metavar="F",
-        help="write the results as JSON to F; without F, to standard output instead of the table",
+        help="write the results as JSON to the file F; without F, print JSON instead of the table",
     )
 
 

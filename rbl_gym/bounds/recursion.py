@@ -61,7 +61,9 @@ def posterior_step(
         motion = motion.checked()
         J = motion.predict(J, states, np.asarray(epoch.rotation))
         if not np.isfinite(J).all():
-            raise ValueError("J must be information about all states, got a singular matrix")
+            raise ValueError(
+                "J must be positive definite (information about all states), got a singular matrix"
+            )
         rows = nuisances.bias_rows(anchors, tags)
         J = nuisances.faded(J, 0 if rows is None else len(rows), motion.seconds)
     told = information_of(epoch, nuisances, epoch.links)  # pyright: ignore[reportArgumentType]

@@ -204,7 +204,10 @@ class BaseStationVectorEnv(BatchEnv):
                 translation, std,
             )  # fmt: skip
             if not math.isfinite(np.vdot(score, score)):
-                raise ValueError("the information about the pose is singular or not finite")
+                raise ValueError(
+                    "the information about the pose is singular or not finite: the prior, process "
+                    "or noise of the scene is too small or too large"
+                )
             self._information[rows], self._score_m[rows] = information, score
 
     @property

@@ -67,8 +67,8 @@ class DirectionLaw(NamedTuple):
             log_std = np.asarray(np.zeros_like(bias) if log_std is None else log_std, dtype=float)
             if bias.ndim != 2 or bias.shape[1] % 2 or log_std.shape != bias.shape:
                 raise ValueError(
-                    f"{name} and {name}_log_std must be (n, 2 H), a cosine and a sine of every "
-                    f"harmonic, got {bias.shape} and {log_std.shape}"
+                    f"{name} and {name}_log_std must have shape (n, 2 H), a cosine and a sine "
+                    f"of every harmonic, got {bias.shape} and {log_std.shape}"
                 )
             if not (np.isfinite(bias).all() and np.isfinite(log_std).all()):
                 raise ValueError(f"{name} and {name}_log_std must be finite")

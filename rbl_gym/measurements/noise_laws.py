@@ -72,7 +72,7 @@ class RangeNoise:
         check_number("proportional", self.proportional, low=0.0)
         if self.floor_m == 0 and self.proportional == 0:
             raise ValueError(
-                "floor_m and proportional must not both be zero: the ranges would be free of noise"
+                "floor_m and proportional must not both be zero: the ranges would have no noise"
             )
         tag = self.reference_tag
         if tag is not None and (isinstance(tag, bool) or not isinstance(tag, Integral)):

@@ -364,7 +364,7 @@ def recorded(
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, ("L", 3))
     if times.ndim != 1 or len(times) < 2 or (np.diff(times) <= 0).any():
-        raise ValueError("times must be (L,) with L >= 2 and strictly increasing")
+        raise ValueError(f"times must be two or more and increase strictly, got {times!s:.80}")
     for name, value, shape in (
         ("rotation", rotation, (len(times), 3, 3)),
         ("translation", translation, (len(times), 3)),

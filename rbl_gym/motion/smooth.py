@@ -140,7 +140,7 @@ def through(
     translation = check_array("translation", translation, ("K", 3))
     count = len(times)
     if times.ndim != 1 or count < 2 or (np.diff(times) <= 0).any():
-        raise ValueError("times must be (K,) with K >= 2 and strictly increasing")
+        raise ValueError(f"times must be two or more and increase strictly, got {times!s:.80}")
     if rotation.shape != (count, 3, 3) or translation.shape != (count, 3):
         raise ValueError(
             f"rotation and translation must hold {count} poses, one for each time, got shapes "

@@ -191,7 +191,7 @@ def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
     if (length == 0).any():
         i, j = edges[int(np.argmin(length))]
         raise ValueError(
-            f"positions must differ along edges, those of nodes {i} and {j} are the same"
+            f"positions of nodes with an edge must differ, those of {i} and {j} are the same"
         )
     across /= length
     both = np.repeat(across, 2, axis=0)
@@ -266,7 +266,9 @@ def frame_covariance(
             / check_number("range_std_m", range_std_m, low=1e-12)
         )
     elif known_pair is None:
-        raise ValueError("known_pair must be given without ranges, got None")
+        raise ValueError(
+            "either known_pair or ranges must be given, as one of them sets the scale; got neither"
+        )
     free = free_columns(len(positions))
     J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
     if known_pair is not None:
@@ -280,7 +282,7 @@ def frame_covariance(
     if len(values) and values[0] <= 1e-12 * values[-1]:
         missing = int((values <= 1e-12 * values[-1]).sum())
         raise ValueError(
-            f"edges must determine all frames, but {missing} directions have no information"
+            f"edges must determine all frames, but {missing} of their unknowns remain free"
         )
     factor = basis @ vectors / np.sqrt(values)
     return factor @ factor.T
@@ -313,7 +315,7 @@ def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
         length = float(np.linalg.norm(apart))
         if length == 0:
             raise ValueError(
-                f"positions must differ along edges, those of nodes {i} and {j} are the same"
+                f"positions of nodes with an edge must differ, those of {i} and {j} are the same"
             )
         u = apart / length
         # d u = (I - u u^T) (dp_j - dp_i) / length; a rotation w of the observer adds -w x u.

@@ -208,7 +208,7 @@ def triangle_rotation(
     for name, normal in (("u_ik", normal_i), ("u_jk", normal_j)):
         if np.linalg.norm(normal) < 1e-9:
             raise ValueError(
-                f"{name} must not be parallel to the line of sight, the nodes are collinear"
+                f"{name} must not be parallel to the line between i and j: the nodes are collinear"
             )
     return _triad(axis, normal_i) @ _triad(-other, normal_j).T
 

@@ -119,7 +119,9 @@ def directions_of(positions: FloatArray, edges: IntArray) -> FloatArray:
     same = (apart == 0).all(axis=1)
     if same.any():
         pair = edges[int(np.argmax(same))].tolist()
-        raise ValueError(f"positions must differ along edges, those of nodes {pair} are the same")
+        raise ValueError(
+            f"positions of nodes with an edge must differ, those of nodes {pair} are the same"
+        )
     return np.arctan2(apart[:, 1], apart[:, 0])
 
 
@@ -212,7 +214,7 @@ def measure_in_space(
     apart = positions[..., j, :] - positions[..., i, :]
     length = np.linalg.norm(apart, axis=-1, keepdims=True)
     if not length.all():
-        raise ValueError("positions must differ along edges, got two nodes on the same point")
+        raise ValueError("positions of nodes with an edge must differ, got two at the same point")
     toward = np.stack([apart, -apart], axis=-2) / length[..., None]
     observers = np.stack([orientations[..., i, :, :], orientations[..., j, :, :]], axis=-3)
     exact = np.einsum("...ba,...b->...a", observers, toward)

@@ -91,7 +91,7 @@ def sample(problem: Problem, n_places: int = 1024, turns: int = 1, seed: int = 0
         count = max(round(n_places * zone.weight / total), min(_LEAST_PLACES, n_places))
         places = free_places(zone, problem.obstacles, count)
         if not len(places):
-            raise ValueError(f"zone {zone.name!r} has no free place")
+            raise ValueError(f"zone {zone.name!r} has no free place: obstacles cover it")
         n = len(places)
         rng = np.random.default_rng([seed, index])
         rows.append(

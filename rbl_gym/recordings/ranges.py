@@ -86,7 +86,7 @@ def read_log(
     settle(measured, table, ids, format, said)
     used = measured.cause == 0
     if not used.any():
-        raise ValueError(f"{table.path}: must have an epoch with a link, got none")
+        raise ValueError(f"{table.path}: must have at least one usable range, got none")
     shape = len(epochs), len(ids[0]), len(ids[1])
     places = anchors.at(epochs)[0]
     if other is not None:

@@ -189,7 +189,9 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
         for kind, path in (("anchor", files.anchors), ("tag", files.tags))
     )
     if files.carrier is not None and anchors is None:
-        raise ValueError("carrier needs a table of anchors, in the carrier's frame")
+        raise ValueError(
+            "carrier needs anchors: a table of the anchors in the frame of the carrier"
+        )
     if files.relative and files.carrier is None:
         raise ValueError("relative needs a carrier")
     log = read_log(table, anchors, tags, format, said)
@@ -221,7 +223,7 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
         law = read_directions(files.directions, ids, format.of("directions"), said)
     links = log.links
     if not links.any():
-        raise ValueError(f"{table.path}: must have an epoch with a link, got none")
+        raise ValueError(f"{table.path}: must have at least one usable range, got none")
     paths = [table.path if p is None else os.fspath(p) for p in files[:3]]
     how = "carried" if files.carrier else "stand" if log.anchors.tracks is None else "move"
     points = log.anchors.places, log.tags.places

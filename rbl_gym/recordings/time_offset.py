@@ -126,7 +126,7 @@ def time_offset(
         if correlation > _SMOOTH:
             break
     if best is None:
-        raise failed or ValueError("signals do not agree")
+        raise failed or ValueError("signals do not agree at any offset: give the offset")
     return best
 
 
@@ -141,7 +141,10 @@ def _checked(name: str, times: ArrayLike, values: ArrayLike) -> tuple[FloatArray
             f"and {values.shape}"
         )
     if len(times) < _FEWEST or (np.diff(times) <= 0).any():
-        raise ValueError(f"times_{name} must increase and be at least {_FEWEST}, got {len(times)}")
+        raise ValueError(
+            f"times_{name} must increase strictly and have at least {_FEWEST} entries, got "
+            f"{times!s:.80}"
+        )
     return times, values
 
 
@@ -166,7 +169,9 @@ def _on_grid(times: FloatArray, values: FloatArray, step: float, width: float) -
     # At an end the smoothing looks to one side.
     known &= weight > 0.8
     if known.sum() < _FEWEST:
-        raise ValueError(f"signals must have {_FEWEST} points between gaps, got {known.sum()}")
+        raise ValueError(
+            f"signals must have at least {_FEWEST} points outside gaps, got {known.sum()}"
+        )
     result = np.where(known[:, None], result - result[known].mean(axis=0), 0.0)
     return _Signal(float(times[0]), result, known)
 

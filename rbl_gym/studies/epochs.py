@@ -123,7 +123,7 @@ def track_epochs(
         if (sensor := reads(filter)) != "twist":
             measured = getattr(reading, sensor)
             if told is not None and measured is None:
-                raise ValueError(f"the filter needs {_SENSORS[sensor]}, but there is none here")
+                raise ValueError(f"the filter needs {_SENSORS[sensor]}, but the readings have none")
             told, dt = measured, reading.dt if reading.steps is None else reading.steps
         if told is not None:
             moved = filter.predict(state, told, dt)

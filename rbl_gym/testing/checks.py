@@ -122,7 +122,7 @@ def _filter_interface(make_filter: Any, rng: np.random.Generator) -> None:
     for name in ("initial", "predict", "update", "belief"):
         require(
             callable(getattr(filter, name, None)),
-            f"a filter must have the method {name!r}, but {type(filter).__name__} has not",
+            f"a filter must have the method {name!r}, but {type(filter).__name__} has none",
         )
 
 

@@ -64,7 +64,7 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
             )
         return replace(old, value, path)
     if not kinds:
-        raise ValueError(f"{path} has only one kind, so leave out kind; got {value['kind']!r}")
+        raise ValueError(f"{path} has only one kind: leave out kind, got {value['kind']!r}")
     forms = NOISE_FORMS if kinds is NOISE_LAWS else kinds
     kind = forms[check_one_of(f"{path}.kind", value["kind"], list(forms))]
     try:

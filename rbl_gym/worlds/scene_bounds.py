@@ -16,6 +16,11 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = ["posterior_step"]
 
+_SINGULAR = (
+    "the information about the pose is singular or not finite: the prior, process or noise of the "
+    "scene is too small or too large"
+)
+
 
 def posterior_step(
     scene: Scene,
@@ -65,7 +70,7 @@ def posterior_step(
         simulation.shares(scene, at, anchors, links),
     )
     if not all_finite(score):
-        raise ValueError("the information about the pose is singular or not finite")
+        raise ValueError(_SINGULAR)
     return information, score
 
 
@@ -93,7 +98,7 @@ def _joint_step(
     share = simulation.shares(scene, at, anchors, links)
     information = with_epoch(before, information_of(epoch, unknown, share), states)
     if not all_finite(information):
-        raise ValueError("the information about the pose is singular or not finite")
+        raise ValueError(_SINGULAR)
     return information, bounds.score(pose_covariance(information), at.rotation, scene.body)
 
 

@@ -241,7 +241,8 @@ def tables_of(problem: Problem) -> dict[str, Any]:
     kinds = {Walls: "room", Box: "box", Shell: "shell"}
     if type(mounts) not in kinds or len(problem.obstacles.prisms):
         raise ValueError(
-            "a problem with mounts or prisms can only be saved with the tables of its file"
+            "a problem with mounts or prisms can only be saved if it comes from a file: pass "
+            "tables, the content of that file"
         )
     fields: Any = dataclasses.asdict(mounts)  # pyright: ignore[reportArgumentType]
     law = next(name for name, law in NOISE_LAWS.items() if type(noise) is law)

@@ -152,7 +152,7 @@ def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
         k = int(np.argmin(legal))
         raise ValueError(
             f"anchors[{k}] = {anchors[k].tolist()} is not a legal position: off the mounts, or "
-            "inside of an obstacle"
+            "inside an obstacle"
         )
     start = State(world, Layout(anchors, stays), np.mean(problem.corners(), axis=0))
     return start if not problem.obstacles.contain(start.body) else _beside(start)

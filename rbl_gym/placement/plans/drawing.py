@@ -93,7 +93,7 @@ def scaled(drawing: Drawing, zero: tuple[float, float] | None) -> Drawing:
     if not drawing.shapes:
         kinds = sum(drawing.unread.values(), Counter())
         held = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "nothing"
-        raise ValueError(f"{drawing.path}: no line that can be read; it contains {held}")
+        raise ValueError(f"{drawing.path}: the drawing has no lines that can be read, only {held}")
     scale = UNITS[drawing.units]
     low, high = drawing.bounds()
     said = list(drawing.said)

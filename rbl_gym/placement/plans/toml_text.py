@@ -16,13 +16,13 @@ _REMARKS = {
     "share = 0.95 of the zone",
     "mounts": "where anchors may stand: wall, ceiling, column, area or points",
     "forbidden": "no anchors here",
-    "walls": "after each crossing the share of a link's information that its material sets is left",
+    "walls": "each crossing leaves the share of a link's information that [materials] gives",
     "obstacles": "what weakens links, and where the body cannot be",
     "materials": "share of a link's information that one crossing leaves, 10^(-loss / 10 dB): "
-    "rough values, put your own",
+    "rough values, enter your own",
     "plan": "the drawing from which this was read; layouts are exported to its coordinates",
     "body": "the tags on the body: a shape, or tags = [[x, y, z], ...] in metres",
-    "noise": "standard deviation of a range: put the one of your radio",
+    "noise": "standard deviation of a range: enter that of your radio",
 }
 
 
