@@ -29,15 +29,15 @@ _FIGURES = metrics.Figures._fields
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Estimate a pose belief from the measurements, and compute the reward from the belief.
 
-    Wraps an environment whose unwrapped form has a `scene` (`RBL/Tracking-v0`) and whose
-    observation has `ranges`, `links`, `anchors` and `twist`. In scenes with obstacles it also reads
-    `quality`, and with an inertial sensor the filter ``"iekf-imu"`` reads `inertial`. It also wraps
-    observations with `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter ``"iekf"``). For
+    Wraps `RBL/Tracking-v0`, or another environment that has a `scene` and observes `ranges`,
+    `links`, `anchors` and `twist`. In scenes with obstacles the wrapper also reads `quality`. With
+    an inertial sensor the filter ``"iekf-imu"`` reads `inertial`. The wrapper also accepts
+    `RBL/BaseStation-v0`, which observes `angles`, `station` and `twist` (filter ``"iekf"``). For
     vector environments use `VectorEstimatePose`.
 
-    The wrapped environment does not change: wrappers below this one see its own reward, wrappers
-    above see this one's reward. If the environment's own reward is not needed, ``reward="none"``
-    saves its computing time.
+    The wrapper replaces the reward. Wrappers between the environment and this one still see the
+    environment's own reward. If nobody needs the own reward, ``gym.make(..., reward="none")`` saves
+    the time to compute it.
 
     Parameters
     ----------
@@ -50,10 +50,10 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     options
         Further options of the filter, a JSON-able dict, for example ``{"robust": True}``.
     reward
-        ``"belief"``: ``-log b``, where b is the root mean square tag error in metres expected by
-        the posterior belief (`rbl_gym.bounds.score`). ``"error"``: minus the actual root mean
-        square tag error in metres. For other rewards, options and custom functions see
-        `rewards.reward_of`.
+        ``"belief"``: ``-log b``, where b is the root mean square error of the tag positions in
+        metres that the belief after the update predicts (`rbl_gym.bounds.score`). ``"error"``:
+        minus the real root mean square error of the tag positions in metres. For other rewards,
+        options and custom functions see `rewards.reward_of`.
     observation
         ``"dict"``: the environment's observation, with `belief_rotation` (3, 3),
         `belief_translation` (3,) and `belief_covariance` (6, 6). ``"flat"``: one float32 vector for

@@ -36,10 +36,12 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Estimate orientations from bearings, and poses if lengths are observed; compute rewards.
 
     Wraps `RBL/PlanarNetwork-v0` and replaces its reward. For vector environments use
-    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements. Cycle consensus,
-    (14), summed along a tree, gives the orientations. If lengths are observed, maximum likelihood
-    starts there and gives both orientations and positions. The last estimate determines to which
-    multiple of 2 pi the angles of a cycle sum, so that long cycles do not slip.
+    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements. The cycle iteration
+    (14) of the network paper corrects the edge angles; their sums along a tree are the
+    orientations. If lengths are observed, maximum likelihood starts from these orientations and
+    estimates orientations and positions. The edge angles of a cycle sum to a multiple of 2 pi. The
+    estimate of the previous epoch selects this multiple, because noise can change it in long
+    cycles.
 
     Parameters
     ----------
@@ -52,8 +54,8 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         node.
     cycles, kappa, order
         As in `estimators.cycle_iteration`: the cycles by name, the step or its rule, and
-        ``"synchronous"`` or ``"asynchronous"``. A step that is too large for the cycles of an epoch
-        raises an error in that epoch.
+        ``"synchronous"`` or ``"asynchronous"``. If the step is too large for the cycles of an
+        epoch, this epoch raises an error.
     steps
         Maximum number of iterations in an epoch. If it is too small, residuals are larger than the
         noise, and the belief is wider.
@@ -70,10 +72,14 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Info
     ----
-    `orientation_error_rad` (root mean square over all nodes but node 0) and `belief_rad`, its value
-    expected by the belief; `chi_square` per degree of freedom (0 without degrees of freedom);
-    `consensus_steps` and `consensus_converged`; with lengths `position_error_m`, `pose_error_m` and
-    `belief_m`, the expected pose error. The environment's info is kept.
+    In addition to the environment's info:
+
+    * `orientation_error_rad`: root mean square error over all nodes except node 0; `belief_rad`:
+      its prediction by the belief.
+    * `chi_square`: per degree of freedom; 0 without degrees of freedom.
+    * `consensus_steps`, `consensus_converged`: of the cycle iteration.
+    * With lengths `position_error_m`, `pose_error_m` and `belief_m`, the prediction of the pose
+      error by the belief.
 
     Examples
     --------

@@ -79,12 +79,13 @@ def _tasks_of(env: Any) -> Sequence[Any]:
 class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Reward the layouts of `RBL/AnchorPlacement-v0` by how well a filter tracks with them.
 
-    In every mode the reward with the last anchor is ``-log`` of the root mean square tag error in
-    metres over 8 tracks of 20 epochs through the work region, and 0 before. The body moves between
-    way-points in the region at the scene's speed, with the scene's process noise. The filter starts
-    from the scene's initial uncertainty. Tracks and noise are drawn from a generator seeded with
-    the numbers of the problem. The same layout of the same problem has the same reward; another
-    problem has other tracks.
+    The reward is 0 until the last anchor is placed, in every mode. Then the filter tracks bodies on
+    8 tracks of 20 epochs through the work region. The reward is ``-log`` of the root mean square
+    error of the tag positions in metres. The body moves between way-points in the region at the
+    scene's speed, with the scene's process noise. The filter starts from the scene's initial
+    uncertainty. Tracks and noise are drawn from a generator that is seeded with the numbers of the
+    problem. So the same layout of the same problem has the same reward, and another problem has
+    other tracks.
 
     ``gym.make("rbl_gym:RBL/AnchorPlacement-v0", reward="filter", filter="iekf")`` creates it.
 
@@ -93,13 +94,14 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     env
         The environment.
     filter, options
-        Name of a filter and its options, as in `EstimatePose`. Raises ValueError for a filter that
-        the anchors cannot determine, for example the linear Kalman filters with all anchors on the
-        water's surface.
+        Name of a filter and its options, as in `EstimatePose`. Raises ValueError if no layout
+        determines the pose for this filter, for example for a linear Kalman filter with all anchors
+        on the water's surface.
 
     Info
     ----
-    `tag_error_m`: this error with the last anchor, 0 before. `score_m` is still that of the bound.
+    `tag_error_m`: this error with the last anchor, and 0 before. `score_m` is still the prediction
+    of the bound.
 
     Examples
     --------

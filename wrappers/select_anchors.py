@@ -24,9 +24,10 @@ _NEVER = 1e6
 class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Only the anchors chosen by the action measure, and all anchors stay where they are.
 
-    Wraps `RBL/Tracking-v0`, below `EstimatePose`. The action space is ``MultiBinary(M)``. Links and
-    ranges of the other anchors are 0. Their `quality` is 1, because it is only known with a range.
-    At reset no anchor is chosen, and nothing is measured.
+    Wraps `RBL/Tracking-v0`; `EstimatePose` then wraps the result. The action space is
+    ``MultiBinary(M)``. Links and ranges of the other anchors are 0. Their `quality` is 1, because
+    the quality of a link is only known with its range. At reset no anchor is chosen, and nothing is
+    measured.
 
     Parameters
     ----------

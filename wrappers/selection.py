@@ -151,21 +151,22 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
 
 
 class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
-    """Twelve anchors on the walls of a hall with racks. Choose which ones measure ranges now.
+    """Choose which of the twelve anchors in a hall with racks measure ranges in this step.
 
     ## Description
     A body with six tags drives through a hall. At every step the policy chooses anchors, the body
-    moves, the chosen anchors measure, and a filter updates its belief. Racks block sight: a blocked
-    range carries 2 % of the information. The receiver measures the quality of a link together with
-    the range. The policy does not observe the racks and has to learn where they are.
+    moves, the chosen anchors measure, and a filter updates its belief. Racks block the line of
+    sight: a blocked range has 2 % of the information. The receiver measures the quality of a link
+    together with the range. The policy does not observe the racks. It has to learn where they are.
 
     ## Action space
-    * ``mode="top-k"``: ``Box(-1, 1, (12,))``, scores; the anchors with the `k` highest are chosen.
-    * ``mode="priced"``: ``MultiBinary(12)``, any number of anchors, each for the `price`.
+    * ``mode="top-k"``: ``Box(-1, 1, (12,))``, a score for each anchor; the `k` anchors with the
+      highest scores are chosen.
+    * ``mode="priced"``: ``MultiBinary(12)``, any number of anchors; each costs the `price`.
     * ``mode="subset"``: ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order.
 
-    In the last two modes `action_masks()` returns which actions choose only existing anchors. Other
-    anchors in an action are ignored.
+    In the last two modes `action_masks()` returns the actions that choose only existing anchors. If
+    an action chooses an anchor that does not exist, this anchor is ignored.
 
     ## Observation space
     ``Box(-10, 10, (18,), float32)``, in this order:
@@ -183,9 +184,10 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     Never terminates; truncates after 50 steps of 0.2 s.
 
     ## Info
-    `chosen` (12): the chosen anchors. Those of `EstimatePose`: `score_m`, actual errors
-    `rotation_error_rad`, `position_error_m`, `tag_error_m`, and `nees`. Those of `RBL/Tracking-v0`:
-    `epoch`, the true `rotation` and `translation`, `nlos`.
+    * `chosen` (12): the chosen anchors.
+    * From `EstimatePose`: `score_m`, the real errors `rotation_error_rad`, `position_error_m` and
+      `tag_error_m`, and `nees`.
+    * From `RBL/Tracking-v0`: `epoch`, the true `rotation` and `translation`, `nlos`.
 
     ## Rendering
     ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
@@ -210,9 +212,9 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     * for each anchor the result of its last choice (1: in sight, -1: not in sight, 0: never
       chosen), ``exp(-steps since then / 10)``, and 1 if the anchor exists (M each).
 
-    `filter`, `options`, `reward`: as `EstimatePose`. By default ``"iekf"`` has 2 iterations.
-    `observation`: ``"flat"`` is the above. The others are those of `EstimatePose`, with the memory
-    of `SelectAnchors`; tokens do not include the racks.
+    `filter`, `options`, `reward`: as in `EstimatePose`. By default ``"iekf"`` has 2 iterations.
+    `observation`: ``"flat"`` is the vector above. The other values are those of `EstimatePose`,
+    with the memory of `SelectAnchors`. Tokens do not include the racks.
 
     ## Version history
     * v0: first version.

@@ -204,11 +204,11 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
 
 
 class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Several bodies share the same anchors. Move the anchors so that all bodies are known well.
+    """Move the anchors, which several bodies share, so that the poses of all bodies are known well.
 
     ## Description
-    K bodies move among M anchors. Each body has its own tags, speed and noise, and is tracked by
-    its own filter. An action moves the anchors for all bodies.
+    K bodies move among M anchors. Each body has its own tags, speed and noise. Its own filter
+    tracks it. An action moves the anchors for all bodies.
 
     ## Action space
     As `RBL/Tracking-v0`.
@@ -227,13 +227,14 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
     combines them.
 
     ## Starting state
-    As `RBL/Tracking-v0`, for each body. Anchors that are drawn around a body are drawn around the
-    first one.
+    As in `RBL/Tracking-v0`, for each body. If the scene draws the anchors around a body, they are
+    drawn around the first one.
 
     ## Info
-    Those of `EstimatePose` with an axis of K bodies: `rotation`, `translation`, `nlos`, `score_m`,
-    `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees`; also `epoch`. At reset also
-    `prior_...` and `scene`, the scene overrides of each body as JSON.
+    Infos of `EstimatePose` with an axis of K bodies: `rotation`, `translation`, `nlos`, `score_m`,
+    `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees`. Also `epoch`. The info of a
+    reset also has the priors (`prior_...`) and `scene`, the scene overrides of each body as JSON
+    text.
 
     ## Episode end
     Never terminates; truncates after the steps of the scene.
@@ -254,9 +255,9 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
     ```
 
     * `scene`: a name or a dict of overrides.
-    * `bodies`: overrides of the scene for each body. They must agree in everything that concerns
-      anchors and time.
-    * `filter`, `options`, `reward`: as `EstimatePose`.
+    * `bodies`: overrides of the scene for each body. All bodies must have the same anchors, and the
+      same time step and number of steps.
+    * `filter`, `options`, `reward`: as in `EstimatePose`.
 
     ## Version history
     * v0: first version.

@@ -117,27 +117,27 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
 
 
 class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
-    """Surface craft range to a diving vehicle. Move the craft so that its pose is known well.
+    """Move surface craft, which measure ranges to a diving vehicle, so that its pose is known well.
 
     ## Description
     M craft on the water measure ranges to the tags of a vehicle that dives through way-points. A
-    filter knows the commanded twist and the noise law, and tracks the pose. ``difficulty="easy"``:
-    three craft with up to 4 m/s. ``difficulty="hard"``: two craft with up to 2 m/s. Then no static
-    layout works, and the craft must orbit.
+    filter knows the commanded twist and the noise law, and tracks the pose. ``difficulty="easy"``
+    has three craft with up to 4 m/s. ``difficulty="hard"`` has two craft with up to 2 m/s. Two
+    craft at rest do not determine the pose, so they must orbit.
 
     ## Action space
-    ``Box(-1, 1, (2 M,))``: horizontal velocity of each craft in units of its limit (longer vectors
-    are cut to length 1), in the order of the observation.
+    ``Box(-1, 1, (2 M,))``: horizontal velocity of each craft, in units of its speed limit (longer
+    vectors are cut to length 1), in the order of the observation.
 
     ## Observation space
     ``Box(-10, 10, (15 + 3 M,), float32)``, in this order:
 
-    * estimated depth in 50 m (1);
+    * estimated depth divided by 50 m (1);
     * commanded horizontal velocity divided by the speed (2);
     * log of the pose error's standard deviations divided by those of the prior (6);
     * first two columns of the estimated rotation (6);
-    * horizontal positions of the craft relative to the estimate, in 100 m (2 M);
-    * log of their distances in 100 m (M).
+    * horizontal positions of the craft relative to the estimate, divided by 100 m (2 M);
+    * log of their distances divided by 100 m (M).
 
     Craft are sorted by bearing from the estimate; ``sort_craft=False`` keeps the order of their
     numbers.
@@ -149,9 +149,9 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     Never terminates; truncates after 100 steps of 2 s.
 
     ## Info
-    Those of `EstimatePose`: `score_m` (b of the belief), actual errors `rotation_error_rad`,
-    `position_error_m`, `tag_error_m`, and `nees` (6 degrees of freedom). Those of
-    `RBL/Tracking-v0`: `epoch`, the true `rotation` and `translation`, `nlos`.
+    * From `EstimatePose`: `score_m` (b of the belief), the real errors `rotation_error_rad`,
+      `position_error_m` and `tag_error_m`, and `nees` (6 degrees of freedom).
+    * From `RBL/Tracking-v0`: `epoch`, the true `rotation` and `translation`, `nlos`.
 
     ## Rendering
     ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
@@ -166,13 +166,14 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
 
     `scenes`: a family of scenes instead of `scene`, see `RBL/Tracking-v0`, for example
     ``scenes=[{"name": "auv_craft", "n_anchors": {"integers": [2, 5]}}]``. M is then the largest
-    number of craft. The `difficulty` sets what a scene does not set itself. Entries of missing
-    craft are 0. The observation has 1 + M more entries: the longest move of a craft of the drawn
-    scene in a step (in 10 m), and 1 for existing craft.
+    number of craft. The `difficulty` gives the defaults of fields that a scene does not set.
+    Entries of missing craft are 0. The observation has 1 + M more entries: the longest distance
+    that a craft of the drawn scene can move in a step, divided by 10 m, and for each craft 1 if it
+    exists.
 
-    `filter`, `options`, `reward`: as `EstimatePose`. By default ``"iekf"`` has 2 iterations.
-    `observation`: ``"flat"`` is the above. The others are those of `EstimatePose`, with the craft
-    in the order of their numbers.
+    `filter`, `options`, `reward`: as in `EstimatePose`. By default ``"iekf"`` has 2 iterations.
+    `observation`: ``"flat"`` is the vector above. The other values are those of `EstimatePose`,
+    with the craft in the order of their numbers.
 
     ## Version history
     * v0: first version.

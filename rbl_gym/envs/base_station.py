@@ -242,15 +242,15 @@ class BaseStationVectorEnv(BatchEnv):
 
 
 class BaseStationEnv(ScalarEnv):
-    """A rigid body moves; one base station measures directions to its tags. Estimate its pose.
+    """A rigid body moves, and one base station measures the directions to its tags.
 
     ## Description
     A body carries N tags at known positions in its frame. At every epoch a base station at a known
-    position measures two angles for every tag: alpha between the direction to the tag and the x
-    axis, and beta between it and the z axis (`rbl_gym.measurements.bearing`). The station's axes
-    are the world's axes. Distances are not measured. They follow from the known size of the body,
-    less accurately the farther the body is. Order within a step: the station moves, the body moves,
-    angles are measured, the bound and the reward are computed.
+    position measures two angles for every tag (`rbl_gym.measurements.bearing`). Alpha is the angle
+    between the direction to the tag and the x axis; beta is that to the z axis. The station's axes
+    are the world's axes. Distances are not measured. They follow from the known size of the body;
+    the farther the body is, the less accurate they are. Order within a step: the station moves, the
+    body moves, angles are measured, the bound and the reward are computed.
 
     ## Action space
     ``Box(-1, 1, (3,), float32)``: velocity of the base station in units of its speed limit (3 m/s;
@@ -291,13 +291,13 @@ class BaseStationEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
     ```
 
-    * `scene`: overrides of the default world (`WORLD`), see `rbl_gym.worlds.scenes.get`. Its range
-      noise is not used.
+    * `scene`: overrides of the default world (`WORLD`), see `rbl_gym.worlds.scenes.get`. The noise
+      of ranges is not used.
     * `scenes`, instead of `scene`: such overrides with laws, or a list of them
       (`rbl_gym.worlds.families.SceneFamily`). Every reset draws a world, for example
       ``scenes={"speed_m_s": {"uniform": [1, 4]}}``. All bodies must have the same number of tags.
       The observation then also has `tags` (N, 3), metres, body frame. `info["scene"]` of the reset
-      has the drawn overrides as JSON.
+      has the drawn overrides as JSON text.
     * `angle_std_rad`: standard deviation of an angle.
     * `reward`: ``"bound"`` or ``"none"``.
 

@@ -262,17 +262,17 @@ def _links_of(positions: FloatArray, radius_m: Any, blind_m: Any) -> tuple[BoolA
 
 
 class PlanarNetworkEnv(ScalarEnv):
-    """Move the nodes of a network so that each of them learns its orientation.
+    """Move the nodes of a planar network so that their orientations become known.
 
     ## Description
-    n nodes lie in a square, each with an unknown orientation. Nodes within the sensing radius (and
-    not nearer than the blind zone) measure each other's bearing in their own frames, with noise.
-    Orientations relative to node 0 follow from the bearings of each edge
-    (`rbl_gym.networks.sensing`). They become more exact with more edges and with better connected
-    networks. Nodes move without turning.
+    n nodes are in a square, each with an unknown orientation. Two nodes see each other if their
+    distance is between `blind_m` and `radius_m`. Each then measures the bearing of the other in its
+    own frame, with noise. The bearings of the edges determine the orientations relative to node 0
+    (`rbl_gym.networks.sensing`). The orientations become more accurate with more edges and better
+    connected networks. Nodes move without turning.
 
     ## Action space
-    ``Box(-1, 1, (2 n,))``: displacement of each node in its OWN frame, in units of `step_m`:
+    ``Box(-1, 1, (2 n,))``: displacement of each node in its own frame, in units of `step_m`:
     (forward, left) of node 0, then of node 1, and so on. Nodes stay in the square.
 
     ## Observation space
@@ -285,16 +285,16 @@ class PlanarNetworkEnv(ScalarEnv):
     | `lengths` | (n, n) | float64 | metres, symmetric, 0 without a length. Only with the argument `lengths` |
 
     ``lengths="one"`` gives the exact length of one link, the longest of node 0. ``lengths="all"``
-    gives those of all links, with their own noise. Bearings and a length determine the scale, and
-    with it the positions.
+    gives the lengths of all links, with noise `length_std_m`. Bearings alone do not determine the
+    scale of the network. With a length they determine the positions.
 
     ## Reward
     ``-log b``, where b is the Cramer-Rao bound of the root mean square orientation error in radians
-    of all nodes except node 0. It uses the bearings of this epoch alone and a prior with the
+    of all nodes except node 0. The bound uses only the bearings of this epoch, and a prior with the
     standard deviation pi / sqrt(3) of a uniform angle. With `lengths`, b is the bound of the pose
-    error in metres: that of a point 1 m away from its node, in the frame of node 0. It uses the
-    bearings and lengths of this epoch and the known limits of every link length, `blind_m` and
-    `radius_m`. ``reward="none"``: 0.
+    error in metres: the error of a point 1 m away from its node, in the frame of node 0. This bound
+    uses the bearings and lengths of this epoch, and the known limits of the length of a link,
+    `blind_m` and `radius_m`. ``reward="none"``: 0.
 
     ## Starting state
     Positions are uniform in the square, drawn again until the network is connected (at most 64
@@ -330,9 +330,9 @@ class PlanarNetworkEnv(ScalarEnv):
     * `reward`: ``"bound"`` or ``"none"``.
     * `steps`: length of an episode.
     * `scenes`: a family of networks, a list of dicts (or one dict) with the numbers above from
-      `n_nodes` to `step_m`. Every reset draws one of them. A value may be a law, see
-      `rbl_gym.worlds.families.SceneFamily`. The other arguments are for fields that a dict does not
-      set:
+      `n_nodes` to `step_m`. Every reset draws one of them. A value may be a random law, see
+      `rbl_gym.worlds.families.SceneFamily`. Fields that a dict does not set have the value of the
+      argument with the same name:
     ```python
     env = gym.make(
         "rbl_gym:RBL/PlanarNetwork-v0",
@@ -340,11 +340,11 @@ class PlanarNetworkEnv(ScalarEnv):
     )
     ```
 
-    With `scenes` n is the largest number of nodes. Rows of missing nodes are zeros, and they have
-    no links. The observation has two more keys: `node_mask` (n,), int8, 1 for existing nodes, and
-    `network` (6,), float64: `side_m`, `radius_m`, `blind_m`, `bearing_std_rad`, `length_std_m`,
-    `step_m` of the drawn network. `info["scene"]` of the reset has its fields as JSON.
-    `EstimateNetwork` needs one network for all episodes and raises ValueError.
+    With `scenes` n is the largest number of nodes. Rows of missing nodes are zeros, and missing
+    nodes have no links. The observation has two more keys: `node_mask` (n,), int8, 1 for existing
+    nodes, and `network` (6,), float64: `side_m`, `radius_m`, `blind_m`, `bearing_std_rad`,
+    `length_std_m`, `step_m` of the drawn network. `info["scene"]` of the reset has its fields as
+    JSON text. `EstimateNetwork` does not support `scenes` and raises ValueError.
 
     ## Version history
     * v0: first version.

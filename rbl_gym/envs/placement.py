@@ -148,11 +148,12 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     """Place anchors so that a body in a given work region is localized well.
 
     ## Description
-    Every episode draws a problem: a work region, which is a box inside the scene's volume, and in
-    rooms up to two racks that block sight, in addition to the scene's obstacles. The agent places M
-    anchors on the scene's legal surfaces. The score of a layout is the root mean square tag error
-    in metres, from position and orientation together, that the Cramer-Rao bound gives over 32 fixed
-    poses in the region (`rbl_gym.placement.score`).
+    Every episode draws a problem: a work region, which is a box inside the scene's volume. In rooms
+    it also draws up to two racks that block the line of sight, besides the scene's own obstacles.
+    The agent places M anchors on the scene's legal surfaces. The score of a layout is the root mean
+    square error of the tag positions in metres. It depends on the errors of position and
+    orientation. The Cramer-Rao bound predicts it for 32 fixed poses in the region
+    (`rbl_gym.placement.score`).
 
     ## Action space
     * ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
@@ -170,31 +171,35 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     * ``"mounts"``, or ``sight=True``: the fraction of the poses that each mount of
       `rbl_gym.placement.mounts` sees (57);
     * ``"mounts"``: whether each mount is taken (57);
-    * except in ``"one-shot"``: the one-hot number of the next anchor (M).
+    * except in ``"one-shot"``: which anchor is next, one-hot (M).
 
-    If the legal space and the volume have the same centre, problems are observed mirrored in x and
-    y, so that the region lies towards +x and +y. Racks are then in the order of x, and actions are
-    mirrored back. ``mirror=False`` turns this off.
+    If the legal space and the volume have the same centre, the environment mirrors every problem in
+    x and y so that the region lies towards +x and +y. So a policy need not learn mirror images
+    separately. Observations are mirrored, racks are sorted by x, and actions are mirrored back.
+    ``mirror=False`` turns this off.
 
-    The above is ``observation="flat"``. ``"dict"`` has positions in metres, ``"tokens"`` a token
-    for each anchor, obstacle and mount, with masks; a function gets a `Placing`. All of them are
-    mirrored in the same way.
+    This is the observation with ``observation="flat"``. ``"dict"`` has positions in metres.
+    ``"tokens"`` has a token for each anchor, obstacle and mount, with masks. A function gets a
+    `Placing`. All observations are mirrored in the same way.
 
     ## Reward
-    ``-log score`` with the last anchor, 0 before. ``mode="mounts"``: the decrease of the log score
-    with every anchor, starting from a score of 3 m. ``gym.make(..., reward="filter")`` rewards the
-    accuracy of a filter instead (the wrapper `FilterReward`).
+    ``-log score`` with the last anchor, and 0 before. With ``mode="mounts"`` every anchor is
+    rewarded by the decrease of the log score; the score without anchors counts as 3 m. With
+    ``gym.make(..., reward="filter")`` the reward is the accuracy of a filter (the wrapper
+    `FilterReward`).
 
     ## Episode end
-    Terminates with the last anchor. `env.spec.max_episode_steps` gives the number of steps. (In an
-    environment made from that spec Gymnasium's `TimeLimit` also truncates at that step.)
+    Terminates with the last anchor. `env.spec.max_episode_steps` is the number of steps. (In an
+    environment that is made from this specification, Gymnasium's `TimeLimit` also truncates the
+    episode at its last step.)
 
     ## Info
     * `anchors` (M, 3): positions, zeros for anchors not yet placed.
     * `region`: centre and half size, metres.
     * `racks` (K, 6): centre and half size, metres; the scene's own obstacles first.
-    * `score_m`: score of the complete layout, 0 before.
-    * `action_mask` (57), with ``mode="mounts"``; `action_masks()` gives it as booleans.
+    * `score_m`: score of the complete layout; 0 before the last anchor.
+    * `action_mask` (57), with ``mode="mounts"``: the possible actions. `action_masks()` returns it
+      as booleans.
 
     ## Rendering
     ``render_mode="rgb_array"``: the problem and its anchors in 3-D and in plan, the expected tag
@@ -210,19 +215,19 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", observation="tokens")
     ```
 
-    * `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. Fixed anchors of a building
-      file stay, and the others are placed.
+    * `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. The fixed anchors of a building
+      file keep their positions, and the agent places the others.
     * `scenes`, instead of `scene`: a family of scenes, see below.
     * `mode`: ``"sequential"``, ``"one-shot"`` or ``"mounts"``, see the action space.
     * `racks`: number of racks in a room, 0 to 2.
-    * `n_anchors`: number of placed anchors M; None for the default of
+    * `n_anchors`: number M of anchors to place; None for the default of
       `rbl_gym.placement.task`.
     * `mirror`: whether problems of symmetric scenes are observed mirrored.
     * `sight`: whether to observe what each mount sees; only with racks or obstacles.
     * `observation`: ``"flat"``, ``"dict"``, ``"tokens"``, ``"module:function"`` or a function, see
       below.
     * `reward`: ``"bound"`` or ``"filter"``.
-    * `filter`, `options`: with ``reward="filter"``, as in `EstimatePose`.
+    * `filter`, `options`: the filter with ``reward="filter"``, as in `EstimatePose`.
 
     ## Version history
     * v0: first version.

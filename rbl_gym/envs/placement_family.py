@@ -162,12 +162,12 @@ class PlacementFamilyEnv(PlacementScalarEnv):
     ``Box(-1, 1, (n,), float32)``, in this order:
 
     * centre and size of the region, scaled to the volume of the drawn scene (6);
-    * for each of the scene's own obstacles and the racks its position and half size, scaled to the
-      scene, and a 1; zeros for unused rows (7 K);
+    * a row for each obstacle of the scene and each rack: position and half size, scaled to the
+      scene, then a 1; unused rows are zeros (7 K);
     * a description of the world (18), see `rbl_gym.placement.families.described`;
     * 1 for every anchor of this world (M);
-    * the rest as in `AnchorPlacementEnv`: actions so far (3 M), sight and taken mounts (57 each),
-      one-hot number of the next anchor (M).
+    * as in `AnchorPlacementEnv`: actions so far (3 M), sight and taken mounts (57 each), which
+      anchor is next, one-hot (M).
 
     ``mode="mounts"`` and `sight` need rooms in all scenes.
 
@@ -175,8 +175,9 @@ class PlacementFamilyEnv(PlacementScalarEnv):
     Terminates with the last anchor of the drawn world.
 
     ## Info
-    As in `AnchorPlacementEnv`, padded with zeros, with `anchor_mask` (M,) and `rack_mask` (K,). The
-    info of a reset also has `scene`, the drawn overrides as JSON.
+    As in `AnchorPlacementEnv`, padded with zeros, and the masks `anchor_mask` (M,) and `rack_mask`
+    (K,) of the existing anchors and boxes. The info of a reset also has `scene`, the drawn
+    overrides as JSON text.
     """
 
     batch_class = PlacementFamilyVectorEnv

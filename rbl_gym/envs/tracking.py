@@ -29,7 +29,7 @@ _FAR = 1e9
 
 
 class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """A rigid body moves; anchors measure noisy ranges to its tags. Estimate its pose.
+    """A rigid body moves, and anchors measure noisy ranges to its tags.
 
     ## Description
     A body carries N tags at known positions in its frame. At every epoch M anchors at known
@@ -48,7 +48,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     | key | shape | type | meaning |
     |---|---|---|---|
-    | `ranges` | (M, N) | float64 | metres, 0 without a link; with `links.offset` in the scene of either sign |
+    | `ranges` | (M, N) | float64 | metres, 0 without a link. If the scene has `links.offset`, they may be negative |
     | `links` | (M, N) | int8 | 1 where a range was measured |
     | `anchors` | (M, 3) | float64 | positions of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
@@ -57,9 +57,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     ## Reward
     ``reward="bound"``: ``-log b``, where b is the posterior Cramer-Rao bound of the root mean
-    square tag error in metres, at the true pose. It is the accuracy that an estimator can reach at
-    best with these anchors and all of their ranges. ``reward="none"``: 0, and no bound is computed.
-    This is the fast choice if a wrapper gives the reward.
+    square error of the tag positions in metres, at the true pose. This is the accuracy that the
+    best estimator can reach with these anchors and all of their ranges. ``reward="none"``: 0, and
+    no bound is computed. This saves time if a wrapper gives the reward.
 
     ## Starting state
     A reset draws the start pose, way-points, turn rate, and the anchors that the scene does not
@@ -78,9 +78,10 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     `max_episode_steps` of ``gym.make`` can only shorten an episode.
 
     ## Rendering
-    ``render_mode="rgb_array"``: anchors, body and path in 3-D, a close-up of the body with the 95 %
-    region of its position, and errors against three standard deviations; (540, 960, 3). Beliefs are
-    those of `EstimatePose`. Without this wrapper the region is that of the bound.
+    ``render_mode="rgb_array"``: a frame (540, 960, 3) with the anchors, the body and its path in
+    3-D, a close-up of the body with the 95 % region of its position, and the errors with three
+    standard deviations. The wrapper `EstimatePose` gives the beliefs. Without this wrapper the
+    frame shows the region of the bound.
 
     ## Arguments
     ```python
@@ -102,9 +103,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     With ``scene={"links": {"offset": "tag"}}`` all ranges of a tag share an unknown offset (time
     differences), see `rbl_gym.measurements.offsets`.
 
-    With ``scene={"survey_std_m": 0.05}`` the observed anchor positions are surveyed, with errors of
-    standard deviation 5 cm on every axis. `info["anchors"]` has the true positions. The bound then
-    accounts for the known accuracy of the survey.
+    With ``scene={"survey_std_m": 0.05}`` the observed anchor positions have survey errors with a
+    standard deviation of 5 cm on every axis. `info["anchors"]` has the true positions. The bound
+    then accounts for the accuracy of the survey.
 
     With `scenes` every reset draws a scene from a family, see
     `rbl_gym.worlds.families.SceneFamily`:
@@ -122,13 +123,13 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     )
     ```
 
-    M and N are then the largest numbers of anchors and tags in the family. Rows beyond those of the
-    drawn scene are zeros, and their links 0. The observation has three more keys: `anchor_mask`
-    (M,) and `tag_mask` (N,), int8, 1 for existing anchors and tags; `tags` (N, 3), metres, body
-    frame. It has `quality` if any scene has obstacles.
+    M and N are then the largest numbers of anchors and tags in the family. If the drawn scene has
+    fewer, the remaining rows and links are zeros. The observation has three more keys:
+    `anchor_mask` (M,) and `tag_mask` (N,), int8, 1 for existing anchors and tags; `tags` (N, 3),
+    metres, body frame. It has `quality` if any scene has obstacles.
 
-    `info["scene"]` of the reset has the drawn overrides as JSON. `env.unwrapped.scene` is the scene
-    of the episode. Actions move only existing anchors. If no scene of the family has movable
+    `info["scene"]` of the reset has the drawn overrides as JSON text. `env.unwrapped.scene` is the
+    scene of the episode. Actions move only existing anchors. If no scene of the family has movable
     anchors, the action space is ``Discrete(1)``. Families support no inertial sensor and no
     `links.offset`. With `survey_std_m` they support only ``reward="none"``.
 

@@ -40,8 +40,8 @@ class TaskFamily:
     Parameters
     ----------
     members
-        As `rbl_gym.worlds.families.SceneFamily`. A dict may have `racks` besides the fields of a
-        scene, a number or a law. `n_anchors` of a dict is the number of placed anchors.
+        Scenes as in `rbl_gym.worlds.families.SceneFamily`. A dict may also have the key `racks`, a
+        number or a random law. Its `n_anchors` is the number of anchors to place.
     n_anchors, racks
         Defaults for members that do not set them, see `rbl_gym.placement.task`.
 
@@ -254,11 +254,16 @@ DESCRIBED = 18
 def described(one: PlacementTask) -> FloatArray:
     """Return a description (18,) of a task's world, in [-1, 1].
 
-    In this order: one-hot kind of the legal space: box, walls, shell or other (4); half sizes of
-    the volume and of the legal space, and the offset from the volume's centre to that of the legal
-    space, divided by the scene's extent (9); decimal logarithms divided by 4 of the extent in
-    metres, of the noise of a range of this length divided by the body's radius, and of this radius
-    divided by the extent (3); number of tags divided by 16; information fraction of a blocked link.
+    In this order:
+
+    * kind of the legal space, one-hot: box, walls, shell or other (4);
+    * half sizes of the volume and of the legal space, and the offset from the centre of the volume
+      to that of the legal space, divided by the scene's extent (9);
+    * decimal logarithms, divided by 4, of three quantities: the extent in metres, the noise of a
+      range as long as the extent divided by the body's radius, and this radius divided by the
+      extent (3);
+    * number of tags divided by 16 (1);
+    * fraction of the information that a blocked link keeps (1).
     """
     scene, extent = one.scene, float(one.scene.scales.extent)
     kinds = [isinstance(scene.anchor_region, kind) for kind in _KINDS]

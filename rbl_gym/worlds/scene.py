@@ -85,21 +85,21 @@ class Scene:
         Region of the anchors, their number, and their positions (M, 3) at the start of every
         episode. With `anchors` None every reset draws them in the region.
     anchor_start_m
-        Largest initial distance on every axis between the body and drawn anchors; None: anywhere in
-        their region.
+        Anchors are drawn at most this far from the body, on every axis; None: anywhere in their
+        region.
     anchor_speed_m_s
         Speed limit of the anchors; 0 for fixed anchors.
     survey_std_m
-        Standard deviation per axis of the errors of surveyed anchor positions. They are constant
-        over an episode. Observations and filters have the surveyed positions.
+        Standard deviation per axis of the survey errors of the anchor positions. The errors are
+        constant over an episode. Observations and filters have the positions with errors.
     tags
         Positions (N, 3) in the body frame.
     noise, links
         Noise law of the ranges, and model of the links.
     obstacles, blocked_information
-        Boxes (K, 6) that block sight, centre and half size; a link without line of sight from the
-        anchor to the body's origin has this fraction of its nominal information, that is stronger
-        noise. With 0 it gives no range.
+        Boxes (K, 6) that block the line of sight: centre and half size. A link is blocked if the
+        anchor does not see the body's origin. A blocked link has the fraction `blocked_information`
+        of its nominal information, that is, more noise. With 0 it gives no range.
     prisms
         Obstacles that are polygons in plan between two heights, such as walls. They come from
         building files.
@@ -116,17 +116,17 @@ class Scene:
         same `twist` (6) at every step. ``"random-twist"``: a new direction and rotation axis every
         10 steps, at `speed_m_s` and `spin_rad_s`. ``"orbit"``: a horizontal circle around the
         volume's centre with a radius of 0.35 of the shorter side, nose first. ``"lawn-mower"``:
-        lanes along x, a fifth of the volume apart. On way-points and lanes each episode draws a
-        turn rate with standard deviation `spin_rad_s`.
+        lanes along x, a fifth of the volume apart. With ``"waypoints"`` and ``"lawn-mower"`` each
+        episode draws a turn rate with standard deviation `spin_rad_s`.
     start_rotation, start_translation, start_volume
-        Initial pose. None draws it, uniform on SO(3) and uniform in the start volume. With
-        `start_volume` None that is the volume.
+        Initial pose. If the rotation is None, it is drawn uniformly on SO(3). If the translation is
+        None, it is drawn uniformly in `start_volume`, or in `volume` if `start_volume` is None.
     initial_rotation_rad, initial_translation_m
         Standard deviations of the prior.
     prior
-        ``"drawn"``: the prior mean is drawn around the true pose at epoch 0. ``"start"``: the prior
-        mean is exact one step before epoch 0, has the given standard deviations, and is predicted
-        once (the tracking paper).
+        ``"drawn"``: the prior mean is drawn around the true pose at epoch 0. ``"start"``, as in the
+        tracking paper: one step before epoch 0 the prior mean is the true pose, and the standard
+        deviations are those above; one prediction leads to epoch 0.
     inertial
         Inertial sensor on the body, with readings between epochs: an `InertialSensor`, or a name or
         a dict as in `measurements.inertial.sensor`. None: no sensor. With a sensor the body moves

@@ -200,15 +200,19 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     scene
         A name of `SCENES`, or a mapping with the key ``"name"`` and fields of `Scene` to change.
         Nested fields take mappings: ``{"name": "uwb_room", "steps": 50, "links":
-        {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. The key ``"kind"`` selects another
-        kind of region or noise (``"box"``, ``"walls"``, ``"shell"``; a name of
-        `noise_laws.NOISE_FORMS`: ``"range"``, ``"squared-range"``, ``"reference-range"`` with its
-        `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). If only the
-        number of anchors changes, every reset draws their positions in the region. ``"stretch": [x,
-        y, z]`` finally multiplies volume, anchor region (boxes and walls), anchors and obstacles
-        along the axes. A name that ends in ``.toml`` or ``.json`` is the path of a building file
-        (docs/building_files.md), see `rbl_gym.placement.file_scenes.scene_of_file`. ``"layout":
-        "layout.csv"`` reads the anchor positions from a file of ``rbl-gym place``.
+        {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``.
+
+        * ``"kind"`` in a nested mapping selects another kind. Regions: ``"box"``, ``"walls"``,
+          ``"shell"``. Noise (`noise_laws.NOISE_FORMS`): ``"range"``, ``"squared-range"``,
+          ``"reference-range"`` with `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`,
+          `kappa` and `snr`.
+        * If `n_anchors` changes but `anchors` does not, every reset draws the positions in the
+          anchor region.
+        * ``"stretch": [x, y, z]`` multiplies the volume, the anchor region (box or walls), the
+          anchors and the obstacles by a factor for each axis, after all other changes.
+        * A ``"name"`` that ends in ``.toml`` or ``.json`` is the path of a building file
+          (docs/building_files.md), see `rbl_gym.placement.file_scenes.scene_of_file`.
+        * ``"layout": "layout.csv"`` reads the anchor positions from a file of ``rbl-gym place``.
 
     Raises
     ------
