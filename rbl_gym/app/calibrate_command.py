@@ -14,14 +14,12 @@ def add_calibrate(commands: Any) -> None:
     """Add the parser of ``rbl-gym calibrate``."""
     calibrate = commands.add_parser(
         "calibrate",
-        help=(
-            "calibrate biases, lever arms, clock and noise with truth, or survey the anchors "
-            "without"
-        ),
-        description="With --truth: estimate biases and slopes of links, tag positions, clock "
-        "offsets, noise and bias by the direction of the ray; with --imu also the axes of the "
-        "inertial sensor. Without --truth: estimate the anchor positions from the ranges of "
-        "a moving body. See docs/calibration.md.",
+        help="with truth: estimate biases, tag positions, clock offset and noise; without: survey "
+        "the anchors",
+        description="With --truth: estimate biases and scale errors of links, tag positions, the "
+        "clock offset, noise, and biases that depend on the direction of the ray; with --imu also "
+        "the axes of the inertial sensor. Without --truth: estimate the anchor positions from the "
+        "ranges of a moving body. See docs/calibration.md.",
     )
     add_reading(calibrate)
     _add_plane(calibrate.add_argument_group("knowledge of the body's position"))

@@ -9,11 +9,12 @@ from rbl_gym.app.terminal import add_json, progress, write_json
 from rbl_gym.studies.extras import require
 
 _KINDS = {
-    "ranges": "topic=/uwb,anchor=responder_id,tag=requester_id,range=distance; also std, unit, "
-    "tags (ids of the body), anchor_position, tag_position",
-    "truth": "topic=/pose; for /tf parent=FRAME,child=FRAME; also position, orientation",
-    "imu": "topic=/imu",
-    "odometry": "topic=/odom",
+    "ranges": "topic and fields, as in topic=/uwb,anchor=to,tag=from,range=distance; further keys: "
+    "std, unit, tags (ids of the tags on the body), anchor_position, tag_position",
+    "truth": "topic of the poses, as in topic=/pose; with /tf also parent=FRAME,child=FRAME; "
+    "further keys: position, orientation",
+    "imu": "topic of the inertial sensor, as in topic=/imu",
+    "odometry": "topic of the odometry, as in topic=/odom",
 }
 
 
@@ -29,8 +30,8 @@ def add_convert(commands: Any) -> None:
         "log",
         nargs="+",
         metavar="LOG",
-        help="a .bag, .db3 or .mcap file (several are read as one log), or the folder of a ROS 2 "
-        "bag",
+        help="a .bag file of ROS 1 (or several that follow each other), the folder of a ROS 2 bag, "
+        "or a .db3 or .mcap file",
     )
     convert.add_argument("--out", metavar="DIR", help="folder for the written files")
     convert.add_argument(
@@ -48,7 +49,7 @@ def add_convert(commands: Any) -> None:
     )
     for kind, text in _KINDS.items():
         convert.add_argument(
-            f"--{kind}", metavar="KEY=VALUE,...", type=_table, help=f"{text}; or none"
+            f"--{kind}", metavar="KEY=VALUE,...", type=_table, help=f"{text}; none: do not write it"
         )
     convert.add_argument(
         "--messages",

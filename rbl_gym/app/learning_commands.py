@@ -21,6 +21,7 @@ from rbl_gym.worlds.scene_source import read_scene, read_scenes
 
 # Number of held-out worlds for the score of a trained policy, as in ``evaluate``.
 _WORLDS = 256
+_TASK_HELP = "task (docs/learning.md)"
 
 
 def add_train(commands: Any) -> None:
@@ -31,7 +32,7 @@ def add_train(commands: Any) -> None:
         description="Train a policy on a task. The same seed gives the same policy. See "
         "docs/learning.md for the tasks.",
     )
-    train.add_argument("task", choices=sorted(TASKS))
+    train.add_argument("task", choices=sorted(TASKS), help=_TASK_HELP)
     _add_worlds(train)
     train.add_argument(
         "--algorithm",
@@ -120,7 +121,7 @@ def _add_players(
     parser: argparse.ArgumentParser, tasks: list[str], worlds: int, references: str
 ) -> None:
     """Add options for the task, the policies and references, and the worlds."""
-    parser.add_argument("task", choices=sorted(tasks))
+    parser.add_argument("task", choices=sorted(tasks), help=_TASK_HELP)
     _add_worlds(parser)
     parser.add_argument(
         "--policy",

@@ -62,7 +62,9 @@ def add_reproduce(commands: Any) -> None:
     reproduce = commands.add_parser(
         "reproduce",
         help="reproduce an experiment of a paper: tables, figures, CSV",
-        description="; ".join(f"{name}: {e.summary}" for name, e in experiments().items()),
+        description="Run an experiment of a paper again, and print its table.",
+        epilog="\n".join(f"{name}: {e.summary}" for name, e in experiments().items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     reproduce.add_argument("experiment", choices=sorted(experiments()))
     add_trials(reproduce)

@@ -57,38 +57,37 @@ def experiments() -> dict[str, Experiment]:
     """Return all experiments by name."""
     return {
         "camsap2013": Experiment(
-            "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), thresholds of "
-            "ET-KF",
+            "tracking with KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2, 3)",
             _tracking,
             _camsap2013_figure,
             _shown("reports", "print_camsap2013"),
         ),
         "doa2019": Experiment(
-            "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
+            "a pose from angles at one base station (Fig. 2, Table 1)",
             _late("studies.papers.doa2019", "doa_experiment"),
             _drawn("doa_figures", "doa2019_figure"),
             _shown("doa_figures", "print_doa2019"),
         ),
         "hard": Experiment(
-            "hard conditions: lost and reflected links, wrong starts, outages (docs)",
+            "lost and reflected links, wrong starts, outages (no paper)",
             _late("studies.hard", "compare_hard_conditions"),
             _drawn("hard_figures", "hard_figure"),
             _shown("hard_figures", "print_hard"),
         ),
         "icassp2013": Experiment(
-            "static: LS, CLS, Procrustes, ML at reference ranges of 40 to 100 dB (Figs 2 and 3)",
+            "a pose from one epoch of ranges: LS, CLS, Procrustes, ML (Figs 2, 3)",
             _static,
             _drawn("figures", "static_figure"),
             _shown("reports", "print_static"),
         ),
         "slides2013": Experiment(
-            "5 tags on a rectangular pyramid, 4 anchors: static, and the tracking experiment",
+            "5 tags, 4 anchors: one epoch, and tracking (slides)",
             _late("studies.papers.slides2013", "slides_experiment"),
             _drawn("figures", "slides2013_figure"),
             _shown("reports", "print_slides2013"),
         ),
         "network2009": Experiment(
-            "planar networks: cycle consensus (Figs 3 to 6), convergence, kappa against n",
+            "planar networks, cycle consensus (Figs 3 to 6)",
             _late("studies.papers.network2009", "network_experiment"),
             _drawn("network2009_figures", "network2009_figure"),
             _shown("network2009_figures", "print_network2009"),

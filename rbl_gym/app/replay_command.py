@@ -37,8 +37,10 @@ def add_replay(commands: Any) -> None:
     """
     replay = commands.add_parser(
         "replay",
-        help="run a filter on a recording of ranges",
-        description="Track a body with the ranges of a recording. With --truth, report the errors.",
+        help="track a body with the ranges of a recording",
+        description="Track a body with the ranges of a recording. With --truth, report the errors. "
+        "See "
+        "docs/recordings.md.",
     )
     add_reading(replay)
     _add_knowledge(replay.add_argument_group("knowledge of the body's position"))
