@@ -6,23 +6,30 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from rbl_gym import __version__
-from rbl_gym.app import (
-    bench_command,
-    bounds_command,
-    calibrate_command,
-    convert_command,
-    learning_commands,
-    network_command,
-    paper_commands,
-    place_command,
-    plan_command,
-    replay_command,
-    studio_command,
-)
 from rbl_gym.studies.extras import MissingExtraError
 
+# The commands and the module of `rbl_gym.app` with the function `add_NAME` of each, in the order of
+# the help.
+_COMMANDS = {
+    "demo": "paper_commands",
+    "place": "place_command",
+    "plan": "plan_command",
+    "studio": "studio_command",
+    "train": "learning_commands",
+    "evaluate": "learning_commands",
+    "transfer": "learning_commands",
+    "bench": "bench_command",
+    "rerun": "bench_command",
+    "bounds": "bounds_command",
+    "convert": "convert_command",
+    "replay": "replay_command",
+    "calibrate": "calibrate_command",
+    "reproduce": "paper_commands",
+    "network": "network_command",
+}
 # Status of a program whose reader has gone (`| head`): 128 + SIGPIPE, as of git.
 READER_GONE = 141
 
@@ -49,7 +56,8 @@ def _flush() -> None:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
-    parser = _parser()
+    arguments = sys.argv[1:] if arguments is None else arguments
+    parser = _parser(*arguments[:1])
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help(sys.stderr)
@@ -73,7 +81,8 @@ def _run(arguments: Sequence[str] | None) -> int:
     return 2
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(command: str = "") -> argparse.ArgumentParser:
+    """Return the parser of one command; of all commands if there is none of this name."""
     parser = argparse.ArgumentParser(
         prog="rbl-gym",
         description="Localization of rigid bodies by radio. Help for a command: rbl-gym COMMAND "
@@ -81,19 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"rbl-gym {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command")
-    paper_commands.add_demo(commands)
-    place_command.add_place(commands)
-    plan_command.add_plan(commands)
-    studio_command.add_studio(commands)
-    learning_commands.add_train(commands)
-    learning_commands.add_evaluate(commands)
-    learning_commands.add_transfer(commands)
-    bench_command.add_bench(commands)
-    bench_command.add_rerun(commands)
-    bounds_command.add_bounds(commands)
-    convert_command.add_convert(commands)
-    replay_command.add_replay(commands)
-    calibrate_command.add_calibrate(commands)
-    paper_commands.add_reproduce(commands)
-    network_command.add_network(commands)
+    for name in [command] if command in _COMMANDS else _COMMANDS:
+        module = import_module(f"rbl_gym.app.{_COMMANDS[name]}")
+        getattr(module, f"add_{name}")(commands)
     return parser

@@ -7,6 +7,7 @@ import contextlib
 import json
 import re
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ FILTER_HELP = (
     "NAME, NAME/option=value/option=value or MODULE:FACTORY (see Filters with options in "
     "docs/estimators.md)"
 )
+
+# Time between two updates of a progress bar.
+_REFRESH_S = 0.05
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -68,12 +72,18 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
 
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=rich_console(stderr=True)) as bar:
-        task = bar.add_task(label, total=total)
+        task, done, shown = bar.add_task(label, total=total), 0, 0.0
 
         def advance(steps: int = 1, *, more: int = 0) -> None:
-            bar.update(task, advance=steps, total=(bar.tasks[task].total or 0) + more)
+            nonlocal done, total, shown
+            done, total = done + steps, total + more
+            # An update takes as long as an epoch of a filter.
+            if (now := time.monotonic()) > shown + _REFRESH_S:
+                shown = now
+                bar.update(task, completed=done, total=total)
 
         yield advance
+        bar.update(task, completed=done, total=total)
 
 
 def _plain_progress(label: str, total: int) -> Iterator[Advance]:

@@ -169,7 +169,7 @@ def read_runs(
     table = read_table(ranges, format.of("ranges"))
     runs = _runs_of(table)
     return {
-        run: _read(files, table.select(rows), run or None, format, Said())
+        run: _read(files, table if rows.all() else table.select(rows), run or None, format, Said())
         for run, rows in runs.items()
     }
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 # Possible delimiters; white space only if the header has none of the others.
 _DELIMITERS = ("\t", ";", ",")
@@ -99,16 +99,21 @@ def _rows(
 ) -> tuple[list[list[str]], list[int], int | None]:
     """Return the rows below the header, their lines, and the line of a row that was cut off."""
     # A comment becomes an empty row, so that line numbers remain those of the file.
-    text = ("" if line.lstrip()[:1] in ("", "#") else line for line in lines[start + 1 :])
-    rows: list[list[str]] = []
-    numbers: list[int] = []
+    text = [
+        line if "#" < line[:1] < "\x7f" or line.lstrip()[:1] not in ("", "#") else ""
+        for line in lines[start + 1 :]
+    ]
+    while text and not text[-1]:
+        text.pop()
     width, line = len(header), start + 1
-    reader = (
-        None
-        if comma is None
-        else csv.reader(text, delimiter=comma, skipinitialspace=True, strict=True)
-    )
+    reader = _reader(text, comma)
     try:
+        rows = [*map(str.split, text)] if reader is None else [*reader]
+        numbers = [*range(start + 2, start + 2 + len(rows))]
+        # Usually every line is a full row.
+        if len(rows) == len(text) and {*map(len, rows)} == {width}:
+            return rows, numbers, None
+        rows, numbers, reader = [], [], _reader(text, comma)
         for i, row in enumerate(map(str.split, text) if reader is None else reader, 1):
             line = start + 1 + (i if reader is None else reader.line_num)
             if not row:
@@ -125,6 +130,11 @@ def _rows(
         line = line if reader is None else start + 1 + reader.line_num
         raise ValueError(f"{path}, line {line}: {error}") from error
     return rows, numbers, None
+
+
+def _reader(text: list[str], comma: str | None) -> Any:
+    """Return a reader of rows; None: they are separated by white space."""
+    return comma and csv.reader(text, delimiter=comma, skipinitialspace=True, strict=True)
 
 
 def _check_decimals(path: str, rows: list[list[str]], numbers: list[int]) -> None:

@@ -30,7 +30,7 @@ __all__ = ["track_figures"]
 
 # The truth is at the mirror pose if its mean square error is below this share of the track's.
 _NEARER = 0.25
-# Number of epochs that is sufficient to estimate the delay of the truth.
+# Number of epochs that is sufficient to find a fault of the truth.
 _ENOUGH = 1000
 
 
@@ -205,14 +205,12 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
 
     gap_s, counts = settings.comparison.truth_gap_s, ~excluded_epochs(track.times, settings)
     step = slice(None, None, _stride(track.times, gap_s))
-    poses = track.rotation[step], track.translation[step], track.covariance[step]
-    some = Track(track.times[step], *poses)
+    some = Track(*(a[step].copy() for a in track[:4]))
 
-    def at(late_s: float, whole: bool) -> Judged:
-        rotation, epochs = (truth.rotation, track) if whole else (None, some)
+    def at(late_s: float, turned: bool) -> Judged:
+        rotation = truth.rotation if turned else None
         moved = aligned._replace(times=truth.times - late_s, rotation=rotation)
-        there = matched(moved, *epochs[:3], gap_s)
-        return judged_of(there, epochs, reference.planar, counts if whole else counts[step])
+        return judged_of(matched(moved, *some[:3], gap_s), some, reference.planar, counts[step])
 
     def seen(rotation: FloatArray) -> FloatArray:
         return reference.alignment.rotation @ as_judged(rotation, settings, reference.planar)

@@ -158,9 +158,9 @@ def fault_hints(
     Parameters
     ----------
     at
-        Function ``at(delay, rotations)`` that returns the compared poses. `delay`, in seconds,
-        corrects the time stamps of the truth. With `rotations` the result has the rotations of the
-        file at all epochs; without it has some epochs and no rotations.
+        Function ``at(delay, rotations)`` that returns the compared poses at some epochs. `delay`,
+        in seconds, corrects the time stamps of the truth. With `rotations` the result has the
+        rotations of the file; without it has no rotations.
     seen
         Function that converts rotations (L, 3, 3) of the file to those that are compared.
     planar
