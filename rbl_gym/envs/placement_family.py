@@ -153,7 +153,7 @@ class PlacementFamilyVectorEnv(PlacementBatchEnv):
 
 
 class PlacementFamilyEnv(PlacementScalarEnv):
-    """`AnchorPlacementEnv` with `scenes` instead of `scene`; this page lists the differences.
+    """`AnchorPlacementEnv` with `scenes` instead of `scene`; these are the differences.
 
     Every reset draws a world: its scene, the number of anchors, the racks. M and K are the largest
     numbers of anchors and boxes in the family. `scenes` is as in `TaskFamily`.

@@ -174,8 +174,10 @@ _AXIS = {"axis": Key("place", "direction [x, y, z] in which anchors look; defaul
 _OF_LAWS = {
     "floor_m": "standard deviation of a short range, metres",
     "proportional": "growth of the standard deviation with the range, metres per metre",
-    "reference_tag": "index of the tag on whose range the noise of an anchor depends",
-    "sigma_m": "standard deviation of a squared range over the range to the first tag, metres",
+    "reference_tag": "index of a tag; the range to this tag sets the noise of all ranges of an "
+    "anchor",
+    "sigma_m": "standard deviation of a squared range, divided by the range to the first tag, "
+    "metres",
 }
 
 
