@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rbl_gym import bodies, placement, ranging, rotations
-from rbl_gym.placement import Gain, Sample, score_and_gradient
+from rbl_gym.measurements.noise_laws import numbers_of
+from rbl_gym.placement import Gain, Sample, gradient, score_and_gradient
 from rbl_gym.placement import sample as samples
 
 LAWS = {
@@ -68,6 +69,20 @@ def test_gradient_is_that_of_differences(law, gain):
     np.testing.assert_allclose(gradient, found, atol=1e-7 * max(1.0, np.abs(gradient).max()))
     assert np.abs(gradient).max() > 1e-4
     assert score > 0
+
+
+def test_every_problem_of_a_batch_has_a_law_of_its_own():
+    rng = np.random.default_rng(5)
+    poses, tags = sample(rng, len(LAWS)), bodies.pyramid(1.0)
+    anchors = rng.normal(0, 12, (len(LAWS), 4, 3))
+    numbers = np.array([numbers_of(law, len(tags)) for law in LAWS.values()])
+    share = np.ones((len(poses.places), 4, len(tags)))
+    told = np.zeros_like(anchors), *poses[:4], tags, numbers, Gain().numbers, share
+    score, slopes = gradient.of_arrays(anchors, *told)
+    for k, law in enumerate(LAWS.values()):
+        alone = score_and_gradient(anchors[k], poses, tags, law)
+        np.testing.assert_allclose(score[k], alone[0], rtol=1e-9)
+        np.testing.assert_allclose(slopes[k], alone[1], rtol=1e-9, atol=1e-12)
 
 
 def test_score_is_the_root_of_the_weighted_mean_square_by_hand():

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rbl_gym.studies.learning import policies
+from rbl_gym.app import learning_commands
+from rbl_gym.app.cli import main
+from rbl_gym.studies.learning import policies, trained_worlds
 from rbl_gym.studies.learning.policies import Policy
 from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
 from rbl_gym.studies.learning.set_policies import SetPolicy
 from rbl_gym.worlds.families import family
 from rbl_gym.worlds.scene_source import read_scene, read_scenes
-from tests.helpers import needs
+from tests.helpers import ROOT, needs
 
 DRAWN = {"name": "auv_craft", "n_anchors": {"integers": [2, 3]}, "steps": 4}
 TOML = """
@@ -84,6 +87,81 @@ def test_a_task_in_other_worlds_keeps_what_else_it_says():
 
 def test_a_task_of_one_scene_is_a_family_of_one():
     assert [one.n_anchors for one in rl_task("mobile-hard").family().corners] == [2]
+
+
+# --- the worlds in a policy's file ------------------------------------------------------------
+
+
+def trained(monkeypatch, tmp_path, *options: str) -> str:
+    """Return the file of `rbl-gym train selection` with a policy of zeros."""
+    from rbl_gym.studies.learning import training
+
+    def zeros(name, task, steps, seed, advance, algorithm):
+        env = task.make(1)
+        n, m = env.single_observation_space.shape[0], env.single_action_space.shape[0]
+        policy = Policy((np.zeros((m, n)),), (np.linspace(-1, 1, m),), "box", {"task": name})
+        return policy, {"steps": 0}
+
+    monkeypatch.setattr(training, "train", zeros)
+    monkeypatch.setattr(learning_commands, "_WORLDS", 2)
+    path = str(tmp_path / f"p{len([*tmp_path.glob('*.npz')])}.npz")
+    assert main(["train", "selection", "--out", path, "--json", *options]) == 0
+    return path
+
+
+def played(capsys, *paths: str) -> str:
+    policies = [word for path in paths for word in ("--policy", path)]
+    capsys.readouterr()
+    code = main(["evaluate", "selection", "--references", "random", "--worlds", "2", "--json"]
+                + policies)  # fmt: skip
+    printed = capsys.readouterr()
+    return json.loads(printed.out)["task"] if code == 0 else printed.err
+
+
+def test_a_policy_keeps_the_scene_of_its_training(monkeypatch, tmp_path, capsys):
+    """Its evaluation plays there, also when the file of the scene is gone."""
+    file = tmp_path / "short.json"
+    file.write_text(json.dumps({"name": "hall", "n_anchors": 5, "steps": 3}))
+    path = trained(monkeypatch, tmp_path, "--scene", str(file))
+    file.unlink()
+    policy = policies.load(path)
+    assert policy.meta["scene"] == {"name": "hall", "n_anchors": 5, "steps": 3}
+    assert trained_worlds.common_worlds("selection", {"p": policy}) == {
+        "scene": policy.meta["scene"]
+    }
+    assert trained_worlds.common_worlds("halls", {"p": policy}) == {}
+    # The hall of the task has 12 anchors, which the policy does not fit.
+    assert played(capsys, path) == "selection in the scene of the training"
+    other = trained(monkeypatch, tmp_path)
+    assert "scene" not in policies.load(other).meta
+    assert "were trained in different scenes" in played(capsys, path, other)
+
+
+def test_the_worlds_of_the_task_are_not_kept():
+    assert trained_worlds.worlds_to_keep({}) == {}
+
+
+def test_a_policy_keeps_families_of_scenes(monkeypatch, tmp_path, capsys):
+    file = tmp_path / "halls.json"
+    file.write_text(json.dumps([{"name": "hall", "steps": 2}]))
+    path = trained(monkeypatch, tmp_path, "--scenes", str(file))
+    assert policies.load(path).meta["scenes"] == [{"name": "hall", "steps": 2}]
+    assert played(capsys, path) == "selection in the scene of the training"
+
+
+def test_a_building_that_changed_since_the_training_is_named(monkeypatch, tmp_path, capsys):
+    building = tmp_path / "warehouse.toml"
+    building.write_text((ROOT / "examples" / "warehouse.toml").read_text())
+    file = tmp_path / "short.json"
+    file.write_text(json.dumps({"name": str(building), "steps": 3}))
+    path = trained(monkeypatch, tmp_path, "--scene", str(file))
+    digest = hashlib.sha256(building.read_bytes()).hexdigest()
+    assert policies.load(path).meta["files"] == {str(building): digest}
+    assert played(capsys, path) == "selection in the scene of the training"
+    building.write_text(building.read_text() + "\n")
+    assert "which has changed since" in played(capsys, path)
+    building.unlink()
+    assert "which is not here" in played(capsys, path)
 
 
 # --- training ---------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ from rbl_gym.app.terminal import (
     write_json,
 )
 from rbl_gym.checks import check_one_of
-from rbl_gym.studies.extras import MissingExtraError
+from rbl_gym.studies.extras import MissingExtraError, require
+from rbl_gym.studies.learning.policies import AnyPolicy
 from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
 from rbl_gym.studies.learning.training import ALGORITHMS
 from rbl_gym.worlds.scene_source import read_scene, read_scenes
@@ -93,7 +94,8 @@ def _add_worlds(parser: argparse.ArgumentParser) -> None:
     worlds.add_argument(
         "--scene",
         metavar="NAME|F",
-        help="a scene in place of that of the task: a name, or a JSON or TOML file",
+        help="a scene in place of that of the task or of the policy's training: a name, or a JSON "
+        "or TOML file",
     )
     worlds.add_argument(
         "--scenes",
@@ -103,18 +105,26 @@ def _add_worlds(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _task(options: argparse.Namespace) -> RlTask:
-    """Return the task in the requested worlds."""
-    task = rl_task(options.task)
+def _worlds(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the requested worlds, as arguments of `RlTask.in_worlds`."""
     if options.scenes:
-        return task.in_worlds(scenes=read_scenes(options.scenes))
-    return task.in_worlds(read_scene(options.scene) if options.scene else None)
+        return {"scenes": read_scenes(options.scenes)}
+    return {"scene": read_scene(options.scene)} if options.scene else {}
 
 
-def _title(options: argparse.Namespace) -> str:
-    """Return a title for the task and its worlds."""
-    worlds = options.scene or options.scenes
+def _title(options: argparse.Namespace, trained: bool = False) -> str:
+    """Return a title for the task and its worlds, `trained`: those of the policy's training."""
+    worlds = options.scene or options.scenes or ("the scene of the training" if trained else "")
     return f"{options.task} in {worlds}" if worlds else options.task
+
+
+def _played(options: argparse.Namespace) -> tuple[RlTask, str, dict[str, AnyPolicy]]:
+    """Return task, title and policies; the worlds are the requested or those of the policies."""
+    from rbl_gym.studies.learning.trained_worlds import common_worlds
+
+    loaded = _policies(options.policy)
+    worlds = _worlds(options) or common_worlds(options.task, loaded)
+    return rl_task(options.task).in_worlds(**worlds), _title(options, bool(worlds)), loaded
 
 
 def _add_players(
@@ -140,9 +150,10 @@ def _add_players(
 
 
 def _train(options: argparse.Namespace) -> int:
-    from rbl_gym.studies.learning import evaluation, policies, training
+    from rbl_gym.studies.learning import evaluation, policies, trained_worlds, training
 
-    task = _task(options)
+    worlds = _worlds(options)
+    task = rl_task(options.task).in_worlds(**worlds)
     steps = options.steps or task.steps
     path = Path(options.out or f"out/{options.task}-{options.seed}.npz")
     algorithm = options.algorithm or task.algorithm
@@ -156,6 +167,7 @@ def _train(options: argparse.Namespace) -> int:
             f"training needs the extra rl ({error.name} is missing): pip install 'rbl-gym[rl]'"
         ) from error
     policy.meta["command"] = _command(options, steps, algorithm)
+    policy.meta.update(trained_worlds.worlds_to_keep(worlds))
     policies.save(policy, path)
     result["policy"] = str(path)
     # Of the file, not of the PPO object: others will load the file.
@@ -181,15 +193,12 @@ def _command(options: argparse.Namespace, steps: int, algorithm: str) -> str:
 def _evaluate(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import evaluation
 
-    task = _task(options)
-    loaded = _policies(options.policy)
+    task, title, loaded = _played(options)
     names = _references(options, task, evaluation.references(task))
-    try:
-        with progress(_title(options)) as advance:
-            result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(str(error)) from error
-    result["task"] = _title(options)
+    _require_searches({*names, *evaluation.strongest(task)})
+    with progress(title) as advance:
+        result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
+    result["task"] = title
     if write_json(result, options.json):
         from rbl_gym.app import reports
 
@@ -200,17 +209,14 @@ def _evaluate(options: argparse.Namespace) -> int:
 def _transfer(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import transfer
 
-    task = _task(options)
-    loaded = _policies(options.policy)
+    task, title, loaded = _played(options)
     names = _references(options, task, transfer.transfer_references(task))
-    try:
-        with progress(_title(options)) as advance:
-            result = transfer.transfer_task(
-                task, loaded, names, options.worlds, options.repeats, options.seed, advance
-            )
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(str(error)) from error
-    result["task"] = _title(options)
+    _require_searches({*names})
+    with progress(title) as advance:
+        result = transfer.transfer_task(
+            task, loaded, names, options.worlds, options.repeats, options.seed, advance
+        )
+    result["task"] = title
     if write_json(result, options.json):
         from rbl_gym.app import reports
 
@@ -227,11 +233,17 @@ def _references(options: argparse.Namespace, task: RlTask, default: list[str]) -
     return list(dict.fromkeys(check_one_of("reference", name, known) for name in names))
 
 
-def _policies(paths: list[str]) -> dict[str, Any]:
+def _require_searches(names: set[str]) -> None:
+    """Raise MissingExtraError for a reference whose library is missing, before the others run."""
+    if "cma-es" in names:
+        require("cmaes", "placement")
+
+
+def _policies(paths: list[str]) -> dict[str, AnyPolicy]:
     """Return policies by file name; raises ValueError if two have the same name."""
     from rbl_gym.studies.learning import policies
 
-    loaded: dict[str, Any] = {}
+    loaded: dict[str, AnyPolicy] = {}
     for path in paths:
         label = Path(path).stem
         if label in loaded:

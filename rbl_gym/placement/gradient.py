@@ -105,12 +105,14 @@ def square_and_gradient(
     link has the information ``F = w q q^T`` with ``q = J_n^T d`` and ``w = g / (var r^2)``, where
     ``d = s_n - a_m`` is its offset and g its gain.
     """
-    noise = ranging.law_of(law)
+    # Laws of several problems are the same for all their poses.
+    noise = ranging.law_of(law if law.ndim == 1 else law[..., None, :])
     J = bounds.tag_jacobian(rotation, tags[..., None, :, :])
     s = ranging.tag_positions(rotation, places, tags[..., None, :, :])
     d = s[..., None, :, :] - anchors[..., None, :, None, :]
     distance = np.sqrt((d**2).sum(axis=-1))
-    full = share / (noise.variance(distance) * distance**2)
+    variance = noise.variance(distance)
+    full = share / (variance * distance**2)
     g, slope_of_gain = share_and_slope(gain, d, normals[..., None, :, None, :] + 0 * d)
     w = full * g
     q = np.einsum("...nia,...mni->...mna", J, d)
@@ -118,28 +120,26 @@ def square_and_gradient(
     S = np.einsum("...nia,...nib->...ab", J, J) / tags.shape[-2]
     Kq = q @ (P @ S @ P)[..., None, :, :]
     told = (q * Kq).sum(axis=-1)
-    by_link, by_reference, reference = _weight_slopes(noise, distance)
+    by_link, by_reference = _weight_slopes(law, distance, variance)
+    by_square = w * told * by_link + (w * told).sum(axis=-1, keepdims=True) * by_reference
     # Derivatives by the offset, of w without its gain, then of the gain.
     slope = np.einsum("...mn,...nia,...mna->...mi", w, J, Kq)
-    slope -= ((w * told * by_link)[..., None] * d).sum(axis=-2)
-    slope -= (w * told * by_reference).sum(axis=-1, keepdims=True) * d[..., reference, :]
+    slope -= (by_square[..., None] * d).sum(axis=-2)
     slope += 0.5 * ((full * told)[..., None] * slope_of_gain).sum(axis=-2)
     square = np.einsum("...ab,...ba->...", S, P)
     return (weight * square).sum(axis=-1), 2 * (weight[..., None, None] * slope).sum(axis=-3)
 
 
 def _weight_slopes(
-    noise: ranging.NoiseLaw, distance: FloatArray
-) -> tuple[FloatArray, FloatArray, int]:
-    """Return minus the derivatives of ``log w`` by two squared distances (..., M, N).
+    law: FloatArray, distance: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return minus the derivatives of ``log w`` by squared distances (..., P, M, N).
 
-    The first is the distance of the link, the second the distance of the reference tag to the same
-    anchor. The third output is the index of the reference tag.
+    The first is of each link by its own distance. The second is of all links of an anchor by the
+    distance of the reference tag, and zero elsewhere.
     """
-    if isinstance(noise, ranging.SquaredRangeNoise):
-        return np.zeros_like(distance), 1 / distance[..., :1] ** 2 + 0 * distance, 0
-    assert isinstance(noise, ranging.RangeNoise)
-    growth = noise.proportional**2 / noise.variance(distance) + 0 * distance
-    if noise.reference_tag is None:
-        return 1 / distance**2 + growth, np.zeros_like(distance), 0
-    return 1 / distance**2, growth, noise.reference_tag
+    kind, _, proportional, reference = np.moveaxis(law, -1, 0)[..., None, None, None]
+    growth, by_square = proportional**2 / variance, 1 / distance**2
+    by_link = np.where(kind == 1, 0.0, by_square + np.where(reference < 0, growth, 0.0))
+    refers = np.arange(distance.shape[-1]) == reference
+    return by_link, np.where(refers, np.where(kind == 1, by_square, growth), 0.0)

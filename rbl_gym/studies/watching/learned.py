@@ -15,6 +15,7 @@ from rbl_gym import placement
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.studies.learning import evaluation, policies, rollouts
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask, rl_task
+from rbl_gym.studies.learning.trained_worlds import common_worlds
 from rbl_gym.studies.watching.frames import Frame
 from rbl_gym.studies.watching.played import env_frames
 from rbl_gym.studies.watching.program import Disturb, Program, env_program
@@ -39,7 +40,7 @@ def learned_program(
     seed
         Seed of the world, the first one of `rbl-gym evaluate` with this seed.
     scene
-        Scene in place of the task's own, as in `RlTask.in_worlds`.
+        Scene in place of that of the training, as in `RlTask.in_worlds`.
 
     Raises
     ------
@@ -47,7 +48,9 @@ def learned_program(
         If the file is not a policy, its task or the reference is unknown, or it does not fit.
     """
     policy = policies.load(path)
-    task = rl_task(str(policy.meta.get("task"))).in_worlds(scene)
+    name = str(policy.meta.get("task"))
+    worlds = common_worlds(name, {Path(path).name: policy}) if scene is None else {"scene": scene}
+    task = rl_task(name).in_worlds(**worlds)
     known = evaluation.references(task)
     if reference is None:
         reference = "gradient" if "gradient" in known else known[-1]
@@ -59,7 +62,7 @@ def learned_program(
 
     env = _env(task)
     shown = env_program(env, None, _held_out(seed))
-    title = f"{policy.meta.get('task')}: {Path(path).stem}"
+    title = f"{name}: {Path(path).stem}"
     return Program(title, shown.room, shown.tags, start, shown.filters, seed)
 
 
