@@ -31,8 +31,8 @@ class Seen(NamedTuple):
     Attributes
     ----------
     observation
-        The environment's observation: `ranges`, `links`, `anchors`, `twist` and so on. Those of
-        drawn worlds are padded, with `anchor_mask`, `tag_mask` and `tags`.
+        The environment's observation: `ranges`, `links`, `anchors`, `twist` and so on. With
+        `scenes=` these arrays are padded, and there are also `anchor_mask`, `tag_mask` and `tags`.
     belief
         The belief after the epoch.
     scene
@@ -54,12 +54,17 @@ ViewLike = str | View
 def flat(seen: Seen) -> np.ndarray:
     """Return belief and anchors as a float32 vector (..., 21 + 4 M), relative and of order one.
 
-    For drawn worlds the shape is (..., 21 + 5 M), and the anchor mask comes last.
+    With `scenes=` the shape is (..., 21 + 5 M), and the anchor mask comes last.
 
-    In this order: estimated position scaled to the scene's volume (3); angular velocity divided by
-    pi/10 per step and velocity divided by the speed (6); log standard deviations of the pose error
-    (6); the first two columns of the estimated rotation (6); anchor positions relative to the
-    estimate divided by the scene's extent (3 M); log of their distances divided by the extent (M).
+    In this order:
+
+    * estimated position, scaled to the scene's volume (3);
+    * angular velocity divided by pi/10 per step, and velocity divided by the speed (6);
+    * logarithms of the standard deviations of the pose error (6);
+    * first two columns of the estimated rotation (6);
+    * anchor positions relative to the estimate, divided by the scene's extent (3 M);
+    * logarithms of their distances divided by the extent (M).
+
     Entries are cut to +-10.
     """
     relative, far = _anchors(seen)
@@ -183,9 +188,10 @@ def viewer_of(observation: ViewLike) -> Viewer:
     ----------
     observation
         A name of `OBSERVATIONS`, or ``"module:function"``, or a function of a `Seen`. A function
-        returns an array, or a dict of arrays, with the leading axes of the belief. Its attribute
-        `space` is the Gymnasium space of one world. Without this attribute the function is called
-        once, and the space has boxes of the shapes and types that it returns.
+        returns an array or a dict of arrays. If the arrays of `Seen` have a leading axis of worlds,
+        the result has it, too. The attribute `space` of the function is the Gymnasium space of one
+        world. Without this attribute the function is called once, and the space has boxes of the
+        shapes and types that it returns.
 
     Raises
     ------

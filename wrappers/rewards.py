@@ -97,9 +97,13 @@ def reward_of(reward: RewardLike) -> Reward:
     Parameters
     ----------
     reward
-        A name of `REWARDS`. Or a dict ``{"kind": NAME, ...}`` with the options of that reward and
-        `action_price`: this price times the sum of squares of the action is subtracted. Or
-        ``"module:function"``. Or a function of an `Outcome` that returns a number for each world.
+        One of these:
+
+        * A name of `REWARDS`.
+        * A dict ``{"kind": NAME, ...}`` with the options of this reward. With the option
+          `action_price`, the price times the sum of the squares of the action is subtracted.
+        * ``"module:function"``, the path of a function.
+        * A function of an `Outcome` that returns a number for each world.
 
     Raises
     ------

@@ -74,15 +74,17 @@ class IteratedEkf:
     process
         Process noise; with leading axes for individual trials.
     iterations
-        Gauss-Newton iterations of an update; a single one is overconfident at high rotation noise.
+        Gauss-Newton iterations of an update. With a single iteration the filter is overconfident if
+        the rotation is noisy.
     robust
-        For real radios. True: Huber's loss on the whitened residuals (threshold 1.5), and exclusion
-        of ranges that contradict the others. ``"late"``: for ranges with mostly late errors,
-        weights that fall with the square of the residual, half as large for late ones.
+        Handling of ranges that do not fit. False: all ranges have full weight. True: Huber's loss
+        on the whitened residuals (threshold 1.5), and ranges that contradict the others are
+        rejected. ``"late"``, for ranges that are mostly too long: weights fall with the square of
+        the residual, and are halved for ranges that are too long.
     offset
-        Ranges of one ``"tag"`` (uplink time differences), ``"anchor"`` or ``"epoch"`` share an
-        unknown offset, independent at every epoch; None: no offset. With an offset, ranges may have
-        any sign, and variances are taken at the distances of the prior.
+        The ranges of one ``"tag"`` (uplink time differences), ``"anchor"`` or ``"epoch"`` share an
+        unknown offset, which is independent at every epoch. None: no offset. With an offset, ranges
+        may be negative, and variances are taken at the distances of the prior.
     """
 
     tags: FloatArray

@@ -90,7 +90,7 @@ class KalmanFamily:
     Parameters
     ----------
     tags
-        (N, 3), metres, body frame, as given (centred tags decouple rotation and translation).
+        (N, 3), metres, body frame. If their mean is zero, rotation and translation are decoupled.
     noise
         Noise law of the ranges; weights are computed from the measured ranges.
     process
@@ -99,10 +99,10 @@ class KalmanFamily:
         ``"none"`` KF, (17)-(22); ``"newton"`` UC-KF, (23)-(27): the rotation of the weighted
         problem (26), then the translation (27); ``"threshold"`` ET-KF: projection (28) if
         ``|Q^T Q - I|_F > threshold``; ``"always"`` KF-ortho, Section V: projection after every
-        update. The projection is fed back.
+        update. The next prediction starts from the projected rotation.
     sigma_q_scale
-        Ratio of the process noise of an entry of Q to that of the rotation; 1 as printed,
-        sqrt(2/3) is consistent.
+        Ratio of the process noise of an entry of Q to that of the rotation. The paper prints 1;
+        with sqrt(2/3) the filter is consistent.
     threshold
         Threshold of the event-triggered filter.
     coupled

@@ -52,8 +52,8 @@ class PoseEstimate(NamedTuple):
         (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN if the links of a trial
         are not enough for the method.
     covariance
-        (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, by
-        the theory of the method. Very large along directions that the ranges do not determine.
+        (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, as
+        predicted for the method. Very large along directions that the ranges do not determine.
     cost
         (...), half the sum of squared whitened range residuals at the pose. For `robust`, only of
         the inliers.
@@ -63,13 +63,13 @@ class PoseEstimate(NamedTuple):
         (...), number of the 6 degrees of freedom that the ranges determine. Below 6 the pose is not
         unique.
     alternatives
-        Other poses that explain the ranges about as well (within 3 sigma of the cost), such as
-        mirror poses; searched for by ``ml`` and ``robust`` if the geometry is poor.
+        Other poses that fit the ranges about as well (within 3 sigma of the cost), such as mirror
+        poses. ``ml`` and ``robust`` search for them if the geometry is poor.
     matrix
         (..., 3, 3), the raw matrix of ``ls``; for all other methods the rotation.
     iterations
-        (...), number of steps until ``nia``, ``pso`` and ``psa`` converged; 0 for all others, which
-        do not count them.
+        (...), number of steps until ``nia``, ``pso`` and ``psa`` converged; 0 for all other
+        methods.
     """
 
     rotation: FloatArray
@@ -105,39 +105,47 @@ def locate(
     noise
         Noise model of the ranges; variances are evaluated at the measured ranges.
     method
-        ``"ls"``: least squares on the squared ranges without the constraint (static paper,
-        (14)). ``"ls-projected"``: its matrix projected onto SO(3), then the translation
-        (slides). ``"cls"`` (alias ``"ctls"``): tag by tag, then an orthogonal Procrustes
-        fit (static paper, (17)-(21), Lemmas 1 and 2, Algorithm 1). ``"procrustes"`` (alias
-        ``"uc-ls"``): weighted orthogonal Procrustes by Newton's method, the optimally
-        constrained least squares (static paper, Remark 2; slides, appendix). ``"ml"``: maximum
-        likelihood of the raw ranges, with a global search if the geometry is poor.
-        ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw ranges. ``"robust"``: for
-        ranges with outliers. ``"robust-late"``: for radio ranges, whose outliers are mostly late:
-        weights fall with the square of the residual and are halved for late ranges. Or a name from
-        the entry-point group ``rbl_gym.locators`` of another package.
+        One of these names, or a name from the entry-point group ``rbl_gym.locators`` of another
+        package:
+
+        * ``"ml"``: maximum likelihood of the raw ranges, with a global search if the geometry is
+          poor.
+        * ``"robust"``: for ranges with outliers. ``"robust-late"``: for radio ranges, whose
+          outliers are mostly too long. Weights fall with the square of the residual, and are halved
+          for ranges that are too long.
+        * ``"two-step"``: ``cls``, then two Gauss-Newton steps on the raw ranges.
+        * ``"ls"``: least squares on the squared ranges without the constraint (static paper, (14)).
+        * ``"ls-projected"``: projects the matrix of ``ls`` onto SO(3), then computes the
+          translation (slides).
+        * ``"cls"`` (alias ``"ctls"``): the position of each tag, then an orthogonal Procrustes fit
+          (static paper, (17)-(21), Lemmas 1 and 2, Algorithm 1).
+        * ``"procrustes"`` (alias ``"uc-ls"``): weighted orthogonal Procrustes fit by Newton's
+          method, the optimum of the constrained least squares (static paper, Remark 2; slides,
+          appendix).
     links
         Mask (..., M, N), True = measured.
     tag_std_m
-        Standard deviation of the tag positions on the body, per axis; marginalised by ``ml``.
+        Standard deviation of the errors of the tag positions on the body, per axis. ``ml``
+        marginalises these errors; the other methods ignore them.
     retraction
         How Newton's method of ``procrustes`` maps a step to a rotation: ``"exponential"`` or
         ``"cayley"`` (slides). Both converge to the same pose.
     offset
-        Which ranges share an unknown offset: those of one ``"tag"`` (uplink time differences, as
-        ranges to the anchors), of one ``"anchor"``, or of the ``"epoch"``, all of them. None: no
-        offset. With an offset, ranges may have any sign, variances are evaluated at the distances
-        from the pose, and `rank` accounts for the offset. Each tag then needs one anchor more. The
-        squared-range methods need five anchors, because they estimate an offset for each tag.
+        Which ranges share an unknown offset. ``"tag"``: all ranges of a tag (uplink time
+        differences). ``"anchor"``: all ranges of an anchor. ``"epoch"``: all ranges of the epoch.
+        None: no offset. With an offset, ranges may be negative, variances are evaluated at the
+        distances from the pose, and `rank` accounts for the offset. Each tag then needs one more
+        anchor. The squared-range methods need five anchors, because they estimate an offset for
+        each tag.
 
     Raises
     ------
     ValueError
         If shapes are wrong, values are NaN, ranges are not positive, or the method is unknown.
-        If `retraction` is not ``"exponential"`` for a method without one. If `offset` is given
-        with `tag_std_m`, or is ``"anchor"`` for a squared-range method. If the anchors or tags are
-        not enough for a squared-range method (four anchors not coplanar; tags not collinear, for
-        ``ls`` not coplanar).
+        If `retraction` is not ``"exponential"`` and the method is not ``procrustes``. If `offset`
+        is given with `tag_std_m`, or is ``"anchor"`` for a squared-range method. If a squared-range
+        method has too few anchors or tags: it needs four anchors that are not coplanar, and tags
+        that are not collinear (``ls``: not coplanar).
     """
     fit = _method(method)
     check_one_of("retraction", retraction, list(RETRACTIONS))

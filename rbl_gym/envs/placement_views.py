@@ -21,8 +21,8 @@ _LIMIT = 10.0
 class Placing(NamedTuple):
     """A placement in progress as input of a view. All arrays have a leading axis (B,) of worlds.
 
-    In the scalar environment B is 1, and the view's result has that axis as well. Positions are
-    mirrored as the observed problem is, see `AnchorPlacementEnv`.
+    In the scalar environment B is 1. The result of the view must have this axis, too. If the
+    environment mirrors the problem (`AnchorPlacementEnv`), positions are mirrored in the same way.
 
     Attributes
     ----------
