@@ -428,7 +428,7 @@ def test_a_check_that_contradicts_the_prediction_is_told_at_the_top():
     assert "mirror" not in warning
     result["check"]["filters"] = {"a": good, "b": bad | {"found": 0.986}}
     *_, warning = place_answer.warnings(result | {"coplanar": True})
-    assert "'b' finds 1.4 % of the bodies elsewhere or not at all; see the table" in warning
+    assert "'b' has no pose or a wrong one for 1.4 % of the bodies; see the table" in warning
     assert warning.endswith("Probable cause: the mirror image behind the plane of the anchors.")
     # A filter that does not know the blocked links says nothing about the prediction.
     result["check"]["filters"] = {"a": good, "a, not told": bad}

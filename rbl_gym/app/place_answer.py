@@ -60,7 +60,7 @@ def warnings(result: dict[str, Any]) -> list[str]:
     if result["coplanar"]:
         found.append(
             "All anchors lie in one plane. Each pose has a mirror image on the other side of the "
-            "plane that fits the ranges as well, so a filter must be told the side (rbl-gym replay "
+            "plane that fits the ranges as well, so a filter must know the side (rbl-gym replay "
             "--volume or --below-anchors). The linear filters (kf, uc-kf, et-kf, kf-ortho) do not "
             "work. An anchor outside the plane removes the mirror image."
         )
@@ -89,7 +89,7 @@ def _contradictions(result: dict[str, Any]) -> list[str]:
             continue
         any_lost |= lost > 0
         if lost > 0:
-            parts.append(f"{name!r} finds {digits(lost)} % of the bodies elsewhere or not at all")
+            parts.append(f"{name!r} has no pose or a wrong one for {digits(lost)} % of the bodies")
         else:
             ratio = max(figures["position_ratio"], figures["rotation_ratio"])
             parts.append(f"the errors of {name!r} are {digits(ratio)} times the predicted ones")
