@@ -104,9 +104,13 @@ def tracks(offset: str | None, trials: int, seed: int) -> dict[str, list[float]]
         smooth.rotation, smooth.translation, episode.rotation, episode.translation
     )
     limit = smoothing_bound.smoothing_crb(
-        episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise,
-        twists, scene.dt, scene.process, scene.prior_covariance, offset=offset,
-    )  # fmt: skip
+        bounds.RangeEpoch(
+            episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise
+        ),
+        bounds.KnownTwist(twists, scene.dt, scene.process),
+        scene.prior_covariance,
+        offset=offset,
+    )
     figures["smoother"] = judged(error, limit, metrics.nees(error, smooth.covariance))
     return figures
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from rbl_gym.networks.g2o import read_graph
 from rbl_gym.placement.scene_files import problem
-from rbl_gym.recordings import Format, Recording, read_recording, read_runs, read_track
+from rbl_gym.recordings import Files, Format, Recording, read_recording, read_runs, read_track
 from rbl_gym.studies.bench import records, spec_files
 from rbl_gym.studies.learning import policies
 
@@ -169,34 +169,36 @@ def _files(part: str, path: Path, **others: bytes) -> dict[str, Any]:
 
 
 def _recording(part: str, path: Path) -> Any:
-    return read_recording(**_files(part, path, truth=TRUTH, calibration=CALIBRATION))
+    return read_recording(Files(**_files(part, path, truth=TRUTH, calibration=CALIBRATION)))
 
 
 def _runs(path: Path) -> Any:
-    return read_runs(**_files("ranges", path), truth=path)
+    return read_runs(Files(**_files("ranges", path), truth=path))
 
 
 def _differences(path: Path) -> Any:
-    return read_recording(**_files("ranges", path))
+    return read_recording(Files(**_files("ranges", path)))
 
 
 def _pseudo(path: Path) -> Any:
-    return read_recording(**_files("ranges", path), format=Format(offset="tag"))
+    return read_recording(Files(**_files("ranges", path)), format=Format(offset="tag"))
 
 
 def _pattern(path: Path) -> Any:
     columns = {"time": "when", "range": "r_{anchor}_{tag}", "std": "sd_{anchor}_{tag}"}
-    return read_recording(**_files("ranges", path), format=Format(columns=columns, unit="cm"))
+    return read_recording(
+        Files(**_files("ranges", path)), format=Format(columns=columns, unit="cm")
+    )
 
 
 def _alone(path: Path) -> Any:
-    return read_recording(path, format=Format(columns={"range": "d[mm]"}))
+    return read_recording(Files(path), format=Format(columns={"range": "d[mm]"}))
 
 
 def _carrier(relative: bool, path: Path) -> Any:
     arms = Format(columns={"carrier.*": "A_*"}, where={"carrier.who": "a"})
     files = _files("carrier", path, truth=TRUTH)
-    return read_recording(**files, relative=relative, format=arms)
+    return read_recording(Files(**files, relative=relative), format=arms)
 
 
 def _problem(path: Path) -> Any:

@@ -493,7 +493,7 @@ def test_anchors_that_move_come_back_as_a_recording(tmp_path):
     log = write_bag(tmp_path / "moving", "mcap", types, messages)
     recordings.convert_bag(log, tmp_path)
     files = (tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags"))
-    anchors = recordings.read_recording(*files).anchors
+    anchors = recordings.read_recording(recordings.Files(*files)).anchors
     want = np.tile(ROOM, (101, 1, 1))
     want[:, 3, 0] = 0.01 * np.arange(101)
     np.testing.assert_allclose(anchors, want, atol=1e-6)

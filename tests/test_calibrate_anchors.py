@@ -15,7 +15,7 @@ from rbl_gym.estimators.calibration.survey_start import (
     anchors_from_points,
     start_from_anchors,
 )
-from rbl_gym.recordings import Recording, align_positions, apply_alignment, read_recording
+from rbl_gym.recordings import Files, Recording, align_positions, apply_alignment, read_recording
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import AnchorSettings, SurveyedAnchors
 from tests.helpers import ROOT
@@ -198,7 +198,7 @@ def test_the_command_writes_anchors_that_replay_reads(tmp_path, capsys):
     assert "correlation of the two" in said
     assert plot.stat().st_size > 10_000
     read = read_recording(
-        files["ranges"], out / "anchors.csv", files["tags"], None, out / "calibration.csv"
+        Files(files["ranges"], out / "anchors.csv", files["tags"], None, out / "calibration.csv")
     )
     assert off(read.anchors, HALL) < 0.06
     assert np.median(ranges - read.ranges) == pytest.approx(0.2, abs=0.08)
@@ -221,7 +221,7 @@ def test_the_command_writes_anchors_that_replay_reads(tmp_path, capsys):
 )
 def test_a_real_hall_from_nothing(told, limit):
     recording = read_recording(
-        LIAS / "dynamic_fast_ranges.csv", LIAS / "anchors_8_14.csv", LIAS / "tags_8_14.csv"
+        Files(LIAS / "dynamic_fast_ranges.csv", LIAS / "anchors_8_14.csv", LIAS / "tags_8_14.csv")
     )
     settings = AnchorSettings("ranges", planar=True, height_offset_m=0.08, epochs=800, **told)
     found = calibrate.survey_anchors(recording, settings)

@@ -19,7 +19,7 @@ from rbl_gym.estimators.calibration import (
 )
 from rbl_gym.estimators.calibration.clock import Clock, find_clock
 from rbl_gym.estimators.calibration.drift import NO_DRIFT, Drift, Whitener, find_drift
-from rbl_gym.recordings import Recording, Truth, read_recording
+from rbl_gym.recordings import Files, Recording, Truth, read_recording
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import CalibratedLinks, LinkSettings
 from tests.helpers import ROOT
@@ -281,7 +281,13 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
     assert "Noise of a range: 0.0" in said
     assert plot.stat().st_size > 10_000
     corrected = read_recording(
-        files["ranges"], files["anchors"], out / "tags.csv", files["truth"], out / "calibration.csv"
+        Files(
+            files["ranges"],
+            files["anchors"],
+            out / "tags.csv",
+            files["truth"],
+            out / "calibration.csv",
+        )
     )
     clean = ranges_of(times, rng, noise=0.0)
     assert np.abs((corrected.ranges - clean).mean(axis=0)).max() < 0.01
@@ -298,10 +304,12 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
 @pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
 def test_a_real_recording_at_a_third_of_its_rate():
     recording = read_recording(
-        LIAS / "dynamic_fast_ranges.csv",
-        LIAS / "anchors_8_14.csv",
-        LIAS / "tags_8_14.csv",
-        LIAS / "dynamic_fast_truth.csv",
+        Files(
+            LIAS / "dynamic_fast_ranges.csv",
+            LIAS / "anchors_8_14.csv",
+            LIAS / "tags_8_14.csv",
+            LIAS / "dynamic_fast_truth.csv",
+        )
     )
     thin = recording._replace(
         times=recording.times[::3], ranges=recording.ranges[::3], links=recording.links[::3]

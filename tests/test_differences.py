@@ -66,7 +66,7 @@ ALL = [(a, b) for a in range(M) for b in range(a)]
 def test_differences_are_pseudo_ranges_with_the_noise_of_arrivals(tmp_path, pairs):
     t, _, _, arrivals, _ = walk(5)
     path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, pairs))
-    log = recordings.read_recording(path, **tables(tmp_path))
+    log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.offset == "tag"
     assert log.links.all()
     ones = np.ones_like(arrivals)
@@ -80,7 +80,7 @@ def test_anchors_that_hang_together_with_no_other_are_left_out(tmp_path):
     t, _, _, arrivals, _ = walk(3)
     pairs = [(1, 0), (2, 1), (3, 2), (5, 4)]
     path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, pairs))
-    log = recordings.read_recording(path, **tables(tmp_path))
+    log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.links[:, :4].all()
     assert not log.links[:, 4:].any()
     assert log.report.dropped["of anchors without a connection to the others"] == 3 * N
@@ -90,7 +90,7 @@ def test_a_deviation_of_a_difference_is_that_of_two_arrivals(tmp_path):
     t, _, _, arrivals, _ = walk(3)
     rows = [[*row, 0.1] for row in difference_rows(t, arrivals, REFERENCE)]
     path = write(tmp_path, "r.csv", HEADER + ",std", rows)
-    log = recordings.read_recording(path, **tables(tmp_path))
+    log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.range_std is not None
     np.testing.assert_allclose(log.range_std, 0.1 / np.sqrt(2))
 
@@ -106,7 +106,7 @@ def test_pseudo_ranges_of_any_sign_are_read(tmp_path, offset):
     ]  # fmt: skip
     path = write(tmp_path, "r.csv", "t,anchor,tag,range", rows)
     format = recordings.Format(offset=offset)
-    log = recordings.read_recording(path, **tables(tmp_path), format=format)
+    log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)), format=format)
     assert log.offset == offset
     assert log.links.all()
     ones = np.ones_like(told)
@@ -114,7 +114,7 @@ def test_pseudo_ranges_of_any_sign_are_read(tmp_path, offset):
         offsets.centred(log.ranges, ones, offset), offsets.centred(told, ones, offset), atol=1e-8
     )
     with pytest.raises(ValueError, match="cannot be used"):
-        recordings.read_recording(path, **tables(tmp_path))
+        recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_bad_rows_are_refused_by_line(tmp_path, row, column, cell, message):
     path = write(tmp_path, "r.csv", HEADER, rows)
     format = recordings.Format(strict=True)
     with pytest.raises(ValueError, match=message) as caught:
-        recordings.read_recording(path, **tables(tmp_path), format=format)
+        recordings.read_recording(recordings.Files(path, **tables(tmp_path)), format=format)
     assert f"line {row + 2}" in str(caught.value) or "time" in message
 
 
@@ -148,7 +148,7 @@ def test_a_pair_that_comes_twice_is_dropped_and_counted(tmp_path):
     rows = difference_rows(t, arrivals, REFERENCE)
     rows.insert(1, [rows[0][0], rows[0][2], rows[0][1], rows[0][3], "1.0"])
     path = write(tmp_path, "r.csv", HEADER, rows)
-    log = recordings.read_recording(path, **tables(tmp_path))
+    log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.report.dropped["twice with two values"] == 1
 
 
@@ -166,20 +166,20 @@ def test_what_does_not_go_with_differences_is_refused(tmp_path, change, message)
     if "calibration" in change:
         change = {"calibration": write(tmp_path, "c.csv", "anchor,tag,bias_m", [[0, 0, 0.1]])}
     with pytest.raises(ValueError, match=message):
-        recordings.read_recording(path, **{**tables(tmp_path), **change})
+        recordings.read_recording(recordings.Files(path, **{**tables(tmp_path), **change}))
 
 
 def test_differences_longer_than_their_anchors_are_apart_are_refused(tmp_path):
     t, _, _, arrivals, _ = walk(5)
     path = write(tmp_path, "r.csv", HEADER, difference_rows(t, 100 * arrivals, REFERENCE))
     with pytest.raises(ValueError, match="units look inconsistent"):
-        recordings.read_recording(path, **tables(tmp_path))
+        recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
 
 
 def test_missing_columns_are_named(tmp_path):
     path = write(tmp_path, "r.csv", "t,anchor_a,tag,difference", [[0, 0, 0, 1.0]])
     with pytest.raises(ValueError, match="anchor_b"):
-        recordings.read_recording(path, **tables(tmp_path))
+        recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
 
 
 def test_the_larger_part_of_a_graph():
@@ -196,7 +196,7 @@ def test_differences_are_replayed_and_smoothed(tmp_path, name):
         tmp_path, "truth.csv", "t,x,y,z,qw,qx,qy,qz",
         np.column_stack([t, place, quaternions]).tolist(),
     )  # fmt: skip
-    log = recordings.read_recording(path, **tables(tmp_path), truth=truth)
+    log = recordings.read_recording(recordings.Files(path, **tables(tmp_path), truth=truth))
     settings = replay.Settings.of(
         filter=name, range_std_m=STD, constant_std_m=1e-3, constant_common_m=0.0,
         drift_std_m=1e-3, smooth=name == "iekf-cv", smooth_constant_m=1e-3, smooth_common_m=0.0,

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rbl_gym.recordings import Format, read_recording
+from rbl_gym.recordings import Files, Format, read_recording
 from tests import fuzz_files
 from tests.fuzz_files import READERS, check
 
@@ -98,7 +98,7 @@ def test_formats(tmp_path):
         parts = ["ranges", *(name for name in beside if rng.random() < 0.7)]
         files: dict[str, Any] = {part: tmp_path / f"{part}.csv" for part in parts}
         try:
-            log = read_recording(**files, format=Format(**options))
+            log = read_recording(Files(**files), format=Format(**options))
         except ValueError:
             continue
         except BaseException as error:

@@ -11,7 +11,14 @@ from rbl_gym import estimators, metrics, motion
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import inertial, ranging
 from rbl_gym.motion import navigation
-from rbl_gym.recordings import Format, read_inertial, read_recording, samples_between, truth_at
+from rbl_gym.recordings import (
+    Files,
+    Format,
+    read_inertial,
+    read_recording,
+    samples_between,
+    truth_at,
+)
 from tests.helpers import ROOT
 
 STARLOC = ROOT.parent / "shared" / "data" / "starloc_two_tags"
@@ -29,9 +36,14 @@ WRONG_TRUTH = (6.4, 7.3)
 def tracked(column, yaw_off_rad, headings):
     """Times, errors (K, 6) and NEES / 6 of the filter from a start 0.3 m off."""
     log: Any = read_recording(
-        STARLOC / "uwb.csv", STARLOC / "anchors.csv", STARLOC / "tags.csv", STARLOC / "truth.csv",
+        Files(
+            STARLOC / "uwb.csv",
+            STARLOC / "anchors.csv",
+            STARLOC / "tags.csv",
+            STARLOC / "truth.csv",
+        ),
         format=Format(columns={"range": column}),
-    )  # fmt: skip
+    )
     sensed = read_inertial(STARLOC / "imu.csv")
     axes = rotations.exp(np.deg2rad(AXES_DEG))
     sensed = sensed._replace(

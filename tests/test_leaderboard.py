@@ -18,7 +18,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.estimators import filter as belief
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings import read_recording
+from rbl_gym.recordings import Files, read_recording
 from rbl_gym.studies import extras, monte_carlo, replay
 from rbl_gym.studies.bench import figures as bench_figures
 from rbl_gym.studies.bench import leaderboard, records, spec_files
@@ -502,7 +502,7 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
     first = found["nominal", "iekf"]
     settings = replay.Settings.of(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
     files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags", "truth")}
-    log = read_recording(**files)
+    log = read_recording(Files(**files))
     track = replay.track_recording(log, settings)
     figures = replay.track_figures(log, track, replay.track_errors(log, track, settings), settings)
     # The stretches leave out what the last of 41 epochs does not fill.

@@ -363,9 +363,11 @@ def test_other_filters_do_not_read_odometry():
 def test_a_wheeled_robot_with_one_tag_from_an_unknown_heading():
     names = {"odometry.t": "2", "odometry.left": "3", "odometry.right": "4"}
     log = recordings.read_recording(
-        REAL / "ranges.csv", truth=REAL / "truth.csv", odometry=REAL / "odometry_raw.txt",
+        recordings.Files(
+            REAL / "ranges.csv", truth=REAL / "truth.csv", odometry=REAL / "odometry_raw.txt"
+        ),
         format=Format(columns=names, wheelbase_m=0.157),
-    )  # fmt: skip
+    )
     settings = replay.Settings.of(filter="iekf-log", planar=True, height_m=0.0)
     figures = replay.replay_recording(log, settings).figures
     assert figures["position_rmse_m"] < 0.09

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from rbl_gym import metrics, ranging
-from rbl_gym.bounds import smoothing as bound
+from rbl_gym import bounds, metrics, ranging
+from rbl_gym.bounds.smoothing import smoothing_crb
 from rbl_gym.estimators.costs.losses import huber
 from rbl_gym.estimators.smoothing import KnownTwist, LogModel, RangeLog, causal_track, smooth
 from rbl_gym.geometry import rotations
@@ -107,10 +107,14 @@ def test_reaches_its_bound_with_honest_beliefs():
     error = metrics.pose_error(
         found.rotation, found.translation, episode.rotation, episode.translation
     )
-    limit = bound.smoothing_crb(
-        episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise,
-        twists, scene.dt, scene.process, scene.prior_covariance, offset="tag",
-    )  # fmt: skip
+    limit = smoothing_crb(
+        bounds.RangeEpoch(
+            episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise
+        ),
+        bounds.KnownTwist(twists, scene.dt, scene.process),
+        scene.prior_covariance,
+        offset="tag",
+    )
     for block in (slice(0, 3), slice(3, 6)):
         of_bound = np.trace(limit[..., block, block], axis1=-2, axis2=-1).mean()
         square = np.square(error[..., block]).sum(axis=-1).mean()

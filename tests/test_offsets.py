@@ -136,10 +136,9 @@ def test_recursions_take_the_offset():
     plain = bounds.posterior_step(np.eye(12), nothing, unknown)
     np.testing.assert_allclose(J[:6, :6] - plain[:6, :6], seen, atol=1e-9 * seen.max())
     Q, t = (np.stack([x] * 3) for x in (rotation, translation))
-    P = smoothing.smoothing_crb(
-        anchors, tags, Q, t, NOISE, np.zeros((2, 6)), 1.0,
-        ProcessNoise(1e-7, 1e-7), np.eye(6), offset="tag",
-    )  # fmt: skip
+    stands = bounds.KnownTwist(np.zeros((2, 6)), 1.0, ProcessNoise(1e-7, 1e-7))
+    epochs = bounds.RangeEpoch(anchors, tags, Q, t, NOISE)
+    P = smoothing.smoothing_crb(epochs, stands, np.eye(6), offset="tag")
     # A body that stands: all epochs add up.
     np.testing.assert_allclose(P[1], np.linalg.inv(np.eye(6) + 3 * seen), rtol=1e-3, atol=1e-9)
 

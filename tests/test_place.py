@@ -11,15 +11,16 @@ import pytest
 
 pytest.importorskip("plotly", reason="needs the extra viz")
 
-from rbl_gym import bounds, placement
+from rbl_gym import bounds, estimators, placement
 from rbl_gym.app import place_answer, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
-from rbl_gym.geometry import obstacles
+from rbl_gym.geometry import bodies, obstacles
 from rbl_gym.placement import criteria, layouts, scene_files
 from rbl_gym.placement import design as search_design
 from rbl_gym.studies.placing import accuracy, design, requirements
 from rbl_gym.studies.placing import check as place_check
 from rbl_gym.studies.placing.answer import Question, place_anchors
+from rbl_gym.studies.placing.out_of_plane import exchange_out_of_plane
 from tests.test_scene_files import GOOD
 
 N_TRIALS = 60
@@ -232,8 +233,8 @@ def test_the_figures_have_these_names(placed):
     result = json.loads(json.dumps(placed.result, allow_nan=False))
     assert set(result) == {
         "scene", "seed", "n_anchors", "verdict", "survive", "zones", "region", "obstacles",
-        "tags_m", "method", "anchors", "cost", "coplanar", "next_anchor", "predicted", "criteria",
-        "layouts", "check", "against_number", "survey",
+        "tags_m", "method", "anchors", "cost", "coplanar", "out_of_plane", "next_anchor",
+        "predicted", "criteria", "layouts", "check", "against_number", "survey",
     }  # fmt: skip
     assert set(result["anchors"][0]) == {
         "name", "x_m", "y_m", "z_m", "mount", "cost", "fixed", "sees", "without",
@@ -283,9 +284,35 @@ def test_coplanar_anchors_are_warned_of_at_the_top(capsys):
     assert result["criteria"]["conditioning"] is None
     (warning,) = place_answer.warnings(result)
     assert "mirror image" in warning
+    assert "add a fourth" in warning
     place_report.print_place(result)
     top, _, _ = capsys.readouterr().out.partition("margin")
     assert "Note: All anchors lie in one plane." in top
+
+
+def test_an_exchange_that_removes_the_mirror_image_is_suggested():
+    problem = scene_files.problem("drone_yard", 5)
+    flat = problem.mounts.project(np.array(
+        [[-60, -40, 0], [60, -40, 0], [60, 50, 0], [-60, 50, 0], [0, -60, 0.0]]
+    ))  # fmt: skip
+    result = place_anchors(problem, Question(range(5, 6), layout=flat, trials=20)).result
+    move = result["out_of_plane"]
+    place = np.array([move[key] for key in ("x_m", "y_m", "z_m")])
+    (warning,) = (text for text in place_answer.warnings(result) if "in one plane" in text)
+    assert f"Anchor {move['anchor']} moved to ({place[0]:.3f}, " in warning
+    moved = flat.copy()
+    moved[int(move["anchor"]) - 1] = place
+    # One epoch of ranges to a flat body: with the exchange no other pose fits as well.
+    tags, pose = bodies.plate(1.0, 1.0), (np.eye(3), np.array([10.0, 5.0, 20.0]))
+    for anchors, more in ((flat, 1), (moved, 0)):
+        ranges = np.linalg.norm(anchors[:, None] - (tags @ pose[0].T + pose[1]), axis=-1)
+        found = estimators.locate(ranges, anchors, tags, problem.noise)
+        assert np.isfinite(found.alternatives.cost).sum() == more
+    buoys = scene_files.problem("auv_buoys", 4)
+    on_water = 90.0 * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    assert exchange_out_of_plane(buoys, on_water, 0) is None
+    told = place_answer.warnings(result | {"out_of_plane": None})
+    assert "allow mounts at another height" in "".join(told)
 
 
 @pytest.mark.parametrize(

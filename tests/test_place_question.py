@@ -436,7 +436,8 @@ def test_a_check_that_contradicts_the_prediction_is_told_at_the_top():
 
 
 @needs("rich")
-def test_no_heading_of_the_check_is_cut(capsys):
+@pytest.mark.parametrize("width", [60, 80, 100, 130])
+def test_no_heading_of_the_check_is_cut(capsys, width):
     parts = ("position", "m"), ("rotation", "deg")
     row = {"found": 1.0, "holds": False, "nees": 123.4, "zones": []} | {
         key: 0.012345
@@ -448,10 +449,12 @@ def test_no_heading_of_the_check_is_cut(capsys):
     rows = place_report._check(check)
     table = new_table(rows.title, rows.headings[:1], rows.headings[1:], whole=1)
     table.add_row(*rows.rows[0])
-    new_console().print(table)
+    new_console(width).print(table)
     shown = capsys.readouterr().out
     assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= width
     assert all(word in shown for heading in rows.headings for word in heading.split())
+    assert all(cell in shown for cell in rows.rows[0])
 
 
 def test_the_verdict_says_what_to_do_next():

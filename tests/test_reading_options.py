@@ -13,7 +13,7 @@ from rbl_gym import motion
 from rbl_gym.app import reading_options
 from rbl_gym.app.cli import main
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings import Format, read_recording
+from rbl_gym.recordings import Files, Format, read_recording
 from tests.helpers import ROOT
 
 DATA = ROOT.parent / "shared" / "data"
@@ -206,7 +206,7 @@ def test_public_sets(name, monkeypatch):
 def test_ranges_that_a_set_has_calibrated(monkeypatch):
     monkeypatch.chdir(DATA / "starloc_two_tags")
     files: dict[str, Any] = {name: f"{name}.csv" for name in ("anchors", "tags", "truth")}
-    log = read_recording("uwb.csv", **files, format=Format(columns={"range": "range_calib"}))
+    log = read_recording(Files("uwb.csv", **files), format=Format(columns={"range": "range_calib"}))
     assert log.range_std is not None
     np.testing.assert_allclose(log.ranges[0].max(), 1.74375)
     np.testing.assert_allclose(log.range_std[0].max(), 0.11086)

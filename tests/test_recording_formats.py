@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbl_gym.recordings import Format, Recording, Report, read_recording, read_runs
+from rbl_gym.recordings import Files, Format, Recording, Report, read_recording, read_runs
 from tests.test_recordings import ANCHORS, LONG, TAGS, TRUTH, WIDE, assert_same, write_and_read
 
 
@@ -23,13 +23,13 @@ def write(folder: Path, **texts: str) -> dict[str, Any]:
 
 def read(folder: Path, ranges: str = LONG, **texts: str) -> Recording:
     texts = {"ranges": ranges, "anchors": ANCHORS, "tags": TAGS, **texts}
-    return read_recording(**write(folder, **texts))
+    return read_recording(Files(**write(folder, **texts)))
 
 
 def read_as(folder: Path, ranges: str, **options) -> Recording:
     files = write(folder, ranges=ranges, anchors=ANCHORS, tags=TAGS)
     run = options.pop("run", None)
-    return read_recording(**files, run=run, format=Format(**options))
+    return read_recording(Files(**files), run=run, format=Format(**options))
 
 
 def note_of(log: Recording, pattern: str) -> str:
@@ -96,7 +96,7 @@ def test_a_column_that_is_mapped_and_not_there(tmp_path):
         read(tmp_path, LONG.replace("t,anchor,tag,range", header, 1))
     columns = {f"anchors.{axis}": f"p{axis}" for axis in "xyz"}
     files = write(tmp_path, ranges=LONG, anchors=ANCHORS.replace("x,y,z", "px,py,pz"), tags=TAGS)
-    assert read_recording(**files, format=Format(columns=columns)).anchors.shape == (3, 3)
+    assert read_recording(Files(**files), format=Format(columns=columns)).anchors.shape == (3, 3)
 
 
 def test_a_pair_of_columns_the_wrong_way_round(tmp_path):
@@ -108,7 +108,7 @@ def test_a_pair_of_columns_the_wrong_way_round(tmp_path):
     assert len(read_as(tmp_path, text, columns={"time": "zeit"}).times) == 2
     files = write(tmp_path, ranges=LONG, anchors=ANCHORS.replace("x", "ost", 1), tags=TAGS)
     with pytest.raises(ValueError, match=r"did you mean anchors.x=ost\?$"):
-        read_recording(**files, format=Format(columns={"anchors.ost": "x"}))
+        read_recording(Files(**files), format=Format(columns={"anchors.ost": "x"}))
 
 
 def test_wide_columns_by_a_pattern(tmp_path):
@@ -326,17 +326,19 @@ def runs_text(*names: str) -> str:
 
 def test_runs(tmp_path):
     files = write(tmp_path, ranges=runs_text("b", "a"), anchors=ANCHORS, tags=TAGS)
-    runs = read_runs(**files)
+    runs = read_runs(Files(**files))
     assert [*runs] == ["b", "a"]
     for name, log in runs.items():
-        assert_same(log, read_recording(**files, run=name))
+        assert_same(log, read_recording(Files(**files), run=name))
         assert log.links.sum() == 5
         np.testing.assert_allclose(log.times, 0.1 * np.arange(5))
     with pytest.raises(ValueError, match=r"has 2 runs, \['b', 'a'\]; choose one"):
-        read_recording(**files)
+        read_recording(Files(**files))
     with pytest.raises(ValueError, match=r"has no run 'c', got \['b', 'a'\]"):
-        read_recording(**files, run="c")
-    assert [*read_runs(**write(tmp_path, ranges=many(5), anchors=ANCHORS, tags=TAGS))] == [""]
+        read_recording(Files(**files), run="c")
+    assert [*read_runs(Files(**write(tmp_path, ranges=many(5), anchors=ANCHORS, tags=TAGS)))] == [
+        ""
+    ]
 
 
 def test_truth_of_runs(tmp_path):
@@ -346,7 +348,7 @@ def test_truth_of_runs(tmp_path):
         truth="run,site,x,y,yaw_deg\na,1,1,2,90\nb,1,3,2,0\n",
     )  # fmt: skip
     for name, place in (("a", [1, 2, 0]), ("b", [3, 2, 0])):
-        truth = read_runs(**files)[name].truth
+        truth = read_runs(Files(**files))[name].truth
         assert truth is not None
         np.testing.assert_array_equal(truth.translation, [place] * 5)
         np.testing.assert_allclose(truth.times, 0.1 * np.arange(5))
@@ -356,13 +358,13 @@ def test_one_tag_without_a_table_of_tags(tmp_path):
     text = "t,anchor,range\n0,A,2\n0,C,3\n"
     for ranges in (text, text.replace(",range", ",tag,range").replace(",2", ",x,2")
                    .replace(",3", ",x,3"), "t,aAt7,aCt7\n0,2,3\n"):  # fmt: skip
-        log = read_recording(**write(tmp_path, ranges=ranges, anchors=ANCHORS))
+        log = read_recording(Files(**write(tmp_path, ranges=ranges, anchors=ANCHORS)))
         np.testing.assert_array_equal(log.tags, np.zeros((1, 3)))
         np.testing.assert_array_equal(log.ranges, [[[2], [0], [3]]])
     with pytest.raises(ValueError, match=r"of several tags need a table of tags, got .*left"):
-        read_recording(**write(tmp_path, ranges=LONG, anchors=ANCHORS))
+        read_recording(Files(**write(tmp_path, ranges=LONG, anchors=ANCHORS)))
     with pytest.raises(ValueError, match=r"of several tags need a table of tags, got .*left"):
-        read_recording(**write(tmp_path, ranges=WIDE, anchors=ANCHORS))
+        read_recording(Files(**write(tmp_path, ranges=WIDE, anchors=ANCHORS)))
     with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'tag'"):
         read(tmp_path, text)
 
@@ -370,20 +372,20 @@ def test_one_tag_without_a_table_of_tags(tmp_path):
 def test_anchors_beside_the_ranges(tmp_path):
     text = "t,range,var,anchor_x,anchor_y,anchor\n0.1,2,.01,0,-1,105\n0.2,3,.01,4,2.5,107\n"
     text += "0.3,2.1,.01,0,-1,105\n"
-    log = read_recording(**write(tmp_path, ranges=text))
+    log = read_recording(Files(**write(tmp_path, ranges=text)))
     assert log.anchor_ids == ("105", "107")
     np.testing.assert_array_equal(log.anchors, [[0, -1, 0], [4, 2.5, 0]])
     np.testing.assert_array_equal(log.ranges[:, :, 0], [[2, 0], [0, 3], [2.1, 0]])
     assert "heights" in note_of(log, "they are 0")
     nameless = "\n".join(line.rsplit(",", 1)[0] for line in text.splitlines())
-    other = read_recording(**write(tmp_path, ranges=nameless))
+    other = read_recording(Files(**write(tmp_path, ranges=nameless)))
     assert other.anchor_ids == ("0 -1 0", "4 2.5 0")
     np.testing.assert_array_equal(other.ranges, log.ranges)
 
 
 def test_anchors_beside_the_ranges_move(tmp_path):
     text = "t,anchor,range,ax,ay,az\n0,A,2,0,0,1\n0,B,3,5,5,1\n1,A,2,2,0,1\n2,B,3,5,5,1\n"
-    log = read_recording(**write(tmp_path, ranges=text))
+    log = read_recording(Files(**write(tmp_path, ranges=text)))
     want = [[[0, 0, 1], [5, 5, 1]], [[2, 0, 1], [5, 5, 1]], [[2, 0, 1], [5, 5, 1]]]
     np.testing.assert_allclose(log.anchors, want)
 
@@ -442,10 +444,16 @@ def two_bodies(relative: bool, folder: Path) -> tuple[Recording, dict[str, np.nd
         columns |= {f"{part}.*": f"{name}_*"}
         columns |= {f"{part}.{a}_deg": f"{name}_{a}" for a in ("roll", "pitch", "yaw")}
     log = read_recording(
-        files["both"], files["arms"], files["arms"], files["both"], carrier=files["both"],
-        relative=relative,
+        Files(
+            files["both"],
+            files["arms"],
+            files["arms"],
+            files["both"],
+            carrier=files["both"],
+            relative=relative,
+        ),
         format=Format(columns=columns, where={"anchors.agent": "1", "tags.agent": "2"}),
-    )  # fmt: skip
+    )
     return log, {**points, **{f"R{n}": turns[n].as_matrix() for n in "AB"}, **places}
 
 
@@ -482,7 +490,9 @@ def test_a_carrier_that_is_nowhere(tmp_path):
     assert log.report.dropped == {"where the carrier's pose is not known": 1}
     assert len(log.times) == 2
     with pytest.raises(ValueError, match="relative needs a carrier"):
-        read_recording(**write(tmp_path, ranges=LONG, anchors=ANCHORS, tags=TAGS), relative=True)
+        read_recording(
+            Files(**write(tmp_path, ranges=LONG, anchors=ANCHORS, tags=TAGS), relative=True)
+        )
 
 
 def test_heights_that_nobody_tells(tmp_path):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings import Recording, Truth, read_recording, truth_at
+from rbl_gym.recordings import Files, Recording, Truth, read_recording, truth_at
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "lias_planar"
 
@@ -46,7 +46,7 @@ def write_and_read(folder: Path, ranges: str | bytes = LONG, **texts: str | byte
         data = text.encode() if isinstance(text, str) else text
         (folder / f"{name}.csv").write_bytes(data)
     files: dict[str, Any] = {name: folder / f"{name}.csv" for name in texts}
-    return read_recording(**files)
+    return read_recording(Files(**files))
 
 
 def poses_at(*args: Any, **options: Any) -> Any:
@@ -287,9 +287,9 @@ def test_missing_file_and_folder(tmp_path):
     write_and_read(tmp_path)
     good = [tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags")]
     with pytest.raises(ValueError, match=r"none.csv: cannot be read, No such file"):
-        read_recording(*good, truth=str(tmp_path / "none.csv"))
+        read_recording(Files(*good, truth=str(tmp_path / "none.csv")))
     with pytest.raises(ValueError, match=r"cannot be read"):
-        read_recording(tmp_path, *good[1:])
+        read_recording(Files(tmp_path, *good[1:]))
 
 
 def test_one_anchor_has_no_scale(tmp_path):
@@ -389,11 +389,13 @@ def test_order_does_not_matter_and_gaps_are_links(tmp_path_factory, data):
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"the real measurements are not at {DATA}")
 def test_real_recording():
     log = read_recording(
-        DATA / "dynamic_fast_ranges.csv",
-        DATA / "anchors_8_14.csv",
-        DATA / "tags_8_14.csv",
-        DATA / "dynamic_fast_truth.csv",
-        DATA / "calibration_8_14.csv",
+        Files(
+            DATA / "dynamic_fast_ranges.csv",
+            DATA / "anchors_8_14.csv",
+            DATA / "tags_8_14.csv",
+            DATA / "dynamic_fast_truth.csv",
+            DATA / "calibration_8_14.csv",
+        )
     )
     assert log.ranges.shape == (13_481, 8, 3)
     assert log.links.any(axis=0).all()

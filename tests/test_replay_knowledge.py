@@ -41,7 +41,7 @@ def outcome(recording, **options):
 def test_one_tag_gives_a_place_and_says_so():
     found = outcome(record(np.zeros((1, 3)))).figures
     assert found["position_rmse_m"] < 0.2
-    assert (found["rank"], found["rank_since_s"]) == (3, 0.0)
+    assert (found["known_directions"], found["known_directions_since_s"]) == (3, 0.0)
     assert found["centre_rmse_m"] == pytest.approx(found["position_rmse_m"])
     assert "axis_rmse_deg" not in found
     (note,) = [note for note in found["notes"] if "do not determine" in note]
@@ -53,7 +53,7 @@ def test_two_tags_give_their_line():
     tags = np.array([[0.0, 0.4, 0.1], [0.0, -0.4, 0.1]])
     result = outcome(record(tags))
     found = result.figures
-    assert found["rank"] == 5
+    assert found["known_directions"] == 5
     assert found["axis_rmse_deg"] < 15
     assert found["centre_rmse_m"] < 0.2
     (note,) = [note for note in found["notes"] if "do not determine" in note]
@@ -66,7 +66,7 @@ def test_two_tags_give_their_line():
     assert held.places[-1] == 3
     # Planar, they give the heading.
     planar = outcome(record(tags), planar=True, height_m=1.0).figures
-    assert planar["rank"] == 6
+    assert planar["known_directions"] == 6
     assert planar["yaw_rmse_deg"] < 12
 
 

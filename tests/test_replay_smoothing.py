@@ -152,7 +152,9 @@ def test_one_tag_and_one_range_at_a_time_of_a_real_robot():
     log = Recording(
         data["t"], ranges, ranges > 0, None, anchors, np.zeros((1, 3)), names, ("0",), truth
     )
-    figures = replay.replay_recording(log, replay.Settings.of(planar=True, smooth=True)).figures
+    figures = replay.replay_recording(
+        log, replay.Settings.of(filter="iekf", planar=True, smooth=True)
+    ).figures
     assert figures["smoothed"]["position_rmse_m"] <= 0.10
     assert figures["smoothed"]["position_rmse_m"] < 0.5 * figures["position_rmse_m"]
 
@@ -166,9 +168,14 @@ def test_one_tag_and_one_range_at_a_time_of_a_real_robot():
 )
 def test_a_real_planar_recording(calibration, limits):
     log = recordings.read_recording(
-        LIAS / "dynamic_fast_ranges.csv", LIAS / "anchors_8_14.csv", LIAS / "tags_8_14.csv",
-        LIAS / "dynamic_fast_truth.csv", calibration,
-    )  # fmt: skip
+        recordings.Files(
+            LIAS / "dynamic_fast_ranges.csv",
+            LIAS / "anchors_8_14.csv",
+            LIAS / "tags_8_14.csv",
+            LIAS / "dynamic_fast_truth.csv",
+            calibration,
+        )
+    )
     settings = replay.Settings.of(
         planar=True, height_offset_m=0.08, yaw_offset_deg=7.0, smooth=True
     )

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from rbl_gym import estimators, metrics, ranging
-from rbl_gym.bounds import smoothing as bound
+from rbl_gym import bounds, estimators, metrics, ranging
+from rbl_gym.bounds.smoothing import smoothing_crb
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.smoothing import (
     Factor,
@@ -331,10 +331,13 @@ def test_reaches_its_bound_with_honest_beliefs(name, seed):
     error = metrics.pose_error(
         found.rotation, found.translation, episode.rotation, episode.translation
     )
-    limit = bound.smoothing_crb(
-        episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise,
-        twists, scene.dt, scene.process, episode.prior_covariance,
-    )  # fmt: skip
+    limit = smoothing_crb(
+        bounds.RangeEpoch(
+            episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise
+        ),
+        bounds.KnownTwist(twists, scene.dt, scene.process),
+        episode.prior_covariance,
+    )
     for axes in (slice(0, 3), slice(3, 6)):
         claimed = np.diagonal(limit, axis1=-2, axis2=-1)[..., axes].sum(axis=-1).mean()
         ratio = np.square(error[..., axes]).sum(axis=-1).mean() / claimed

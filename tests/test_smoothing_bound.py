@@ -10,11 +10,12 @@ from rbl_gym.bounds import smoothing, tridiagonal
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import ProcessNoise
-from rbl_gym.motion.unknown_twist import WanderingTwist
+from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 from tests.helpers import random_world
 
 FORMS = ["textbook", *(["kernel"] if kernels.enabled() else [])]
 NOISE = ranging.RangeNoise(0.1)
+LAW = WanderingTwist(0.4, 2.0, 0.3, 1.0)
 
 
 def chain(rng, batch, K, n):
@@ -70,11 +71,16 @@ def truth(seed, K=6):
     return anchors, tags, np.array(Q), np.array(t), twists, dt
 
 
-@pytest.mark.parametrize("law", [None, WanderingTwist(0.4, 2.0, 0.3, 1.0)])
-def test_last_epoch_is_the_posterior_bound_and_earlier_ones_are_lower(law):
+@pytest.mark.parametrize(
+    ("law", "sensor"),
+    [(None, None), (LAW, None), (LAW, TwistSensor(0.2, 0.5, frame="body"))],
+)
+def test_last_epoch_is_the_posterior_bound_and_earlier_ones_are_lower(law, sensor):
     anchors, tags, Q, t, twists, dt = truth(2)
     process, prior = ProcessNoise(0.1, 0.2), np.diag([0.1] * 3 + [0.3] * 3)
-    found = smoothing.smoothing_crb(anchors, tags, Q, t, NOISE, twists, dt, process, prior, law=law)
+    moved = twists, dt, process
+    moved = bounds.KnownTwist(*moved) if law is None else bounds.UnknownTwist(*moved, law, sensor)
+    found = smoothing.smoothing_crb(bounds.RangeEpoch(anchors, tags, Q, t, NOISE), moved, prior)
     n = found.shape[-1]
     P = np.zeros((n, n))
     P[:6, :6] = prior
@@ -87,10 +93,8 @@ def test_last_epoch_is_the_posterior_bound_and_earlier_ones_are_lower(law):
         gained = np.linalg.inv(J) - found[k]
         assert np.linalg.eigvalsh(gained).min() > -1e-9
         assert np.trace(gained[:6, :6]) > 1e-3 * np.trace(found[k, :6, :6])
-        moved = twists[k], float(dt[k]), process
-        moved = bounds.KnownTwist(*moved) if law is None else bounds.UnknownTwist(*moved, law)
         epoch = bounds.RangeEpoch(anchors, tags, Q[k + 1], t[k + 1], NOISE)
-        J = bounds.posterior_step(J, epoch, moved)
+        J = bounds.posterior_step(J, epoch, moved._replace(twist=twists[k], dt=float(dt[k])))
     np.testing.assert_allclose(found[-1], np.linalg.inv(J), rtol=1e-6, atol=1e-12)
 
 
@@ -111,7 +115,8 @@ def test_against_the_dense_information_of_all_epochs():
         weight = np.linalg.inv(process.covariance(twists[k], dt[k]))
         H += (J.T @ weight @ J).reshape(4, 6, 4, 6)
     expected = np.linalg.inv(H.reshape(24, 24)).reshape(4, 6, 4, 6)
-    found = smoothing.smoothing_crb(anchors, tags, Q, t, NOISE, twists, dt, process, prior, links)
+    epochs = bounds.RangeEpoch(anchors, tags, Q, t, NOISE, links)
+    found = smoothing.smoothing_crb(epochs, bounds.KnownTwist(twists, dt, process), prior)
     for k in range(4):
         np.testing.assert_allclose(found[k], expected[k, :, k], rtol=1e-6, atol=1e-10)
 
@@ -121,8 +126,9 @@ def test_leading_axes_and_a_body_that_stands_still():
     still = ProcessNoise(0.0, 0.0)
     zero, prior = np.zeros_like(twists), np.eye(6)
     at = anchors, tags, np.stack([Q[:1]] * 6, axis=1)[0], np.stack([t[:1]] * 6, axis=1)[0]
-    one = smoothing.smoothing_crb(*at, NOISE, zero, 0.1, still, prior)
-    both = smoothing.smoothing_crb(*at, NOISE, zero, 0.1, still, np.stack([prior, prior]))
+    told = bounds.RangeEpoch(*at, NOISE), bounds.KnownTwist(zero, 0.1, still)
+    one = smoothing.smoothing_crb(*told, prior)
+    both = smoothing.smoothing_crb(*told, np.stack([prior, prior]))
     np.testing.assert_allclose(both[1], one, rtol=1e-9)
     # All epochs measure one pose.
     information = np.eye(6) + 6 * bounds.range_information(*at[:2], Q[0], t[0], NOISE)
@@ -131,10 +137,10 @@ def test_leading_axes_and_a_body_that_stands_still():
 
 @pytest.mark.parametrize(
     ("change", "name"),
-    [({"dt": -0.1}, "dt"), ({"twists": np.zeros((2, 6))}, "twists"), ({"process": 1}, "process")],
+    [({"dt": -0.1}, "dt"), ({"twist": np.zeros((2, 6))}, "twist"), ({"process": 1}, "process")],
 )
 def test_bad_input_is_named(change, name):
     anchors, tags, Q, t, twists, _ = truth(5)
-    arguments = {"twists": twists, "dt": 0.1, "process": ProcessNoise(0.1, 0.1)} | change
+    motion = bounds.KnownTwist(twists, 0.1, ProcessNoise(0.1, 0.1))._replace(**change)
     with pytest.raises(ValueError, match=name):
-        smoothing.smoothing_crb(anchors, tags, Q, t, NOISE, prior_covariance=np.eye(6), **arguments)
+        smoothing.smoothing_crb(bounds.RangeEpoch(anchors, tags, Q, t, NOISE), motion, np.eye(6))

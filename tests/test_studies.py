@@ -76,6 +76,7 @@ def test_bench(capsys, tmp_path):
 
 def test_settings_of_a_replay_by_group_and_by_name():
     grouped = replay.Settings(
+        "iekf",
         range_std_m=0.05,
         motion=replay.Motion(walk_m=0.3),
         biases=replay.Biases(bias_time_s=None),
@@ -84,6 +85,7 @@ def test_settings_of_a_replay_by_group_and_by_name():
         comparison=replay.Comparison(yaw_offset_deg=7),
     )
     named = {
+        "filter": "iekf",
         "range_std_m": 0.05,
         "walk_m": 0.3,
         "bias_time_s": None,
@@ -95,6 +97,13 @@ def test_settings_of_a_replay_by_group_and_by_name():
     assert replay.Settings.of(**named) == grouped
     assert grouped.flat() == {**replay.Settings().flat(), **named}
     assert grouped.changed(walk_m=0.1).motion == replay.Motion()
+    given = {
+        "iekf-log": {},
+        "iekf": {"walk_deg": 5.0},
+        "iekf-bias": {"walk_m": 1.0, "bias_std_m": 1.0},
+    }
+    assert [replay.Settings.of(**fields).filter for fields in given.values()] == [*given]
+    assert replay.Settings() == replay.Settings.of()
     with pytest.raises(ValueError, match="settings have no field 'walk'; the fields are filter, "):
         replay.Settings.of(walk=0.1)
 

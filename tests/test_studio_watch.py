@@ -202,7 +202,7 @@ def log() -> recordings.Recording:
     folder = ROOT / "examples" / "log"
     names = ("ranges", "anchors", "tags", "truth")
     files: dict[str, Any] = {name: folder / f"{name}.csv" for name in names}
-    whole = recordings.read_recording(**files)
+    whole = recordings.read_recording(recordings.Files(**files))
     some = ("times", "ranges", "links")
     return whole._replace(**{name: getattr(whole, name)[:40] for name in some}, range_std=None)
 

@@ -266,7 +266,7 @@ def test_environments_that_are_no_rooms_are_shown_as_pictures():
 def test_a_recording_is_shown_with_its_track():
     folder = ROOT / "examples" / "log"
     files: dict[str, Any] = {name: folder / f"{name}.csv" for name in ("ranges", "anchors", "tags")}
-    log = recordings.read_recording(**files)
+    log = recordings.read_recording(recordings.Files(**files))
     log = log._replace(**{name: getattr(log, name)[:10] for name in ("times", "ranges", "links")})
     track = replay.track_recording(log, replay.Settings.of(filter="iekf"))
     opened = studio.show(log, track, options=OPTIONS)

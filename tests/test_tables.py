@@ -47,6 +47,25 @@ def test_a_table_by_rich_holds_the_same_text(capsys):
         assert text in shown
 
 
+def test_a_plain_table_wider_than_the_terminal_is_split(without_rich, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "21")
+    tables.new_console().print(example())
+    assert capsys.readouterr().out == (
+        "errors [m]\n"
+        "filter  position (m)\n"
+        "------  ------------\n"
+        "iekf          0.0412\n"
+        "------  ------------\n"
+        "bound           0.04\n\n"
+        "filter  NEES\n"
+        "------  ----\n"
+        "iekf    1.02\n"
+        "------  ----\n"
+        "bound\n\n"
+    )
+
+
 def test_plain_progress_is_silent_away_from_a_terminal(without_rich, capsys):
     with terminal.progress("replay", 10) as advance:
         advance()

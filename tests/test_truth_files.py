@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbl_gym.recordings import Truth, read_recording, read_truth, truth_at
+from rbl_gym.recordings import Files, Truth, read_recording, read_truth, truth_at
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import Source
 
@@ -150,11 +150,18 @@ def test_a_recording_takes_it(tmp_path):
     (tmp_path / "a.csv").write_text("anchor,x,y,z\nA,0,0,1\nB,4,0,1\nC,0,4,2\n")
     (tmp_path / "r.csv").write_text("t,anchor,range\n10,A,2.5\n10,B,3\n10.1,C,2.5\n")
     (tmp_path / "t.tum").write_text(FILES["TUM, poses"][0])
-    log = read_recording(tmp_path / "r.csv", tmp_path / "a.csv", truth=tmp_path / "t.tum")
+    log = read_recording(Files(tmp_path / "r.csv", tmp_path / "a.csv", truth=tmp_path / "t.tum"))
     assert log.truth is not None
     assert log.truth.form == "TUM, poses"
     (tmp_path / "c.csv").write_text("t,x,y,z\n" + rows(TIMES, PLACES))
     for relative in (False, True):
         with pytest.raises(ValueError, match=r"c\.csv: the poses of a carrier must have rotations"):
-            read_recording(tmp_path / "r.csv", tmp_path / "a.csv", truth=tmp_path / "t.tum",
-                           carrier=tmp_path / "c.csv", relative=relative)  # fmt: skip
+            read_recording(
+                Files(
+                    tmp_path / "r.csv",
+                    tmp_path / "a.csv",
+                    truth=tmp_path / "t.tum",
+                    carrier=tmp_path / "c.csv",
+                    relative=relative,
+                )
+            )

@@ -13,7 +13,7 @@ from rbl_gym.studies import replay
 from tests.helpers import with_kernels
 from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording
 
-DEFAULTS = replay.Settings()
+DEFAULTS = replay.Settings("iekf")
 
 
 @with_kernels

@@ -62,7 +62,7 @@ def warnings(result: dict[str, Any]) -> list[str]:
             "All anchors lie in one plane. Each pose has a mirror image on the other side of the "
             "plane that fits the ranges as well, so a filter must know the side (rbl-gym replay "
             "--volume or --below-anchors). The linear filters (kf, uc-kf, et-kf, kf-ortho) do not "
-            "work. An anchor outside the plane removes the mirror image."
+            f"work. {_way_out(result)}"
         )
     for zone in result["zones"]:
         if zone["verdict"] == "undecided":
@@ -74,6 +74,23 @@ def warnings(result: dict[str, Any]) -> list[str]:
                 "anchor, or require a little less."
             )
     return found + _contradictions(result)
+
+
+def _way_out(result: dict[str, Any]) -> str:
+    """Return what removes the mirror image of coplanar anchors."""
+    if result["n_anchors"] < 4:
+        return "Three anchors always lie in one plane: add a fourth outside it."
+    move = result["out_of_plane"]
+    if move is None:
+        return (
+            "No mount is far enough from the plane to remove the mirror image: allow mounts at "
+            "another height."
+        )
+    where = ", ".join(f"{move[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
+    return (
+        f"Anchor {move['anchor']} moved to ({where}), {move['mount']}, removes the mirror image; b "
+        f"is then {digits(move['ratio'])} times as large."
+    )
 
 
 def _contradictions(result: dict[str, Any]) -> list[str]:

@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rbl_gym.measurements.offsets import OFFSETS
 
 if TYPE_CHECKING:
     from rbl_gym.recordings import Recording
-
-_FILES = (
-    "ranges",
-    "anchors",
-    "tags",
-    "truth",
-    "calibration",
-    "directions",
-    "carrier",
-    "odometry",
-    "imu",
-    "imu_frame",
-)
 
 
 def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ()) -> None:
@@ -131,24 +119,23 @@ def read_runs(options: argparse.Namespace) -> dict[str, Recording]:
     """Return the recordings given by the options, by name of run."""
     from rbl_gym import recordings
 
-    paths = {name: getattr(options, name) for name in _FILES}
-    how: dict[str, Any] = {
-        "relative": options.relative,
-        "format": recordings.Format(
-            columns=_joined(options.columns),
-            where=_joined(options.where),
-            time_unit=options.time_unit,
-            unit=options.unit,
-            offset=options.offset,
-            wheelbase_m=options.wheelbase_m,
-            turn_unit=options.turn_unit,
-            strict=options.strict,
-        ),
+    given = {
+        field.name: getattr(options, field.name) for field in dataclasses.fields(recordings.Files)
     }
+    files = recordings.Files(**given)
+    format = recordings.Format(
+        columns=_joined(options.columns),
+        where=_joined(options.where),
+        time_unit=options.time_unit,
+        unit=options.unit,
+        offset=options.offset,
+        wheelbase_m=options.wheelbase_m,
+        turn_unit=options.turn_unit,
+        strict=options.strict,
+    )
     if options.which_run is None:
-        return recordings.read_runs(**paths, **how)
-    run = options.which_run
-    return {run: recordings.read_recording(**paths, run=run, **how)}
+        return recordings.read_runs(files, format)
+    return {options.which_run: recordings.read_recording(files, options.which_run, format)}
 
 
 def _pairs(text: str) -> dict[str, str]:

@@ -111,10 +111,6 @@ def _add_filter(group: Any) -> None:
         ("range-std-m", "standard deviation of a range, metres; default: that of the recording, "
          "else 0.12"),
     ))  # fmt: skip
-    # As in version 0.1; now --filter NAME/robust=false.
-    group.add_argument(
-        "--no-robust", dest="robust", action="store_false", default=None, help=argparse.SUPPRESS
-    )
 
 
 def _add_motion(group: Any) -> None:
@@ -309,7 +305,6 @@ def _replay_runs(
 
 def _settings(options: argparse.Namespace) -> Any:
     """Return the `rbl_gym.studies.replay.Settings` of the arguments."""
-    from rbl_gym import estimators
     from rbl_gym.studies import replay
 
     given = {
@@ -318,27 +313,21 @@ def _settings(options: argparse.Namespace) -> Any:
         if getattr(options, name, None) is not None
     }
     given |= told_clocks(options)
-    biases = {name: value for name, value in given.items() if name in _RAW}
     if options.raw:
         if options.calibration:
             raise ValueError("--raw must be left out with --calibration")
-        biases = {**_RAW, **biases}
-    filter = options.filter or ("iekf-imu" if options.imu else _filter_for(given, biases))
-    name, _ = estimators.parse_filter(filter)
-    if biases and name != "iekf-bias":
+        given = {**_RAW, **given}
+    if options.imu:
+        given.setdefault("filter", "iekf-imu")
+    settings = replay.Settings.of(**given)
+    name = settings.filter
+    if given.keys() & _RAW.keys() and name != "iekf-bias":
         raise ValueError(f"--raw and --bias-... need the filter iekf-bias, got {name}")
     of_log = [key for key in given if key.startswith(("constant_", "drift_"))]
     if of_log and name not in ("iekf-log", "iekf-imu"):
         option = of_log[0].replace("_", "-")
         raise ValueError(f"--{option} needs the filter iekf-log, got {name}")
-    return replay.Settings.of(**{**given, **biases, "filter": filter})
-
-
-def _filter_for(given: Mapping[str, Any], biases: Mapping[str, Any]) -> str:
-    """Return a filter for the given inputs; without inputs, one that needs none."""
-    if biases:
-        return "iekf-bias"
-    return "iekf" if "walk_m" in given or "walk_deg" in given else "iekf-log"
+    return settings
 
 
 def _start(text: str) -> tuple[float, ...]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+import shutil
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 
 def has_rich() -> bool:
@@ -42,8 +44,8 @@ def new_table(
     figures: Iterable[str] = (),
     notes: Iterable[str] = (),
     whole: int = 0,
-) -> Any:
-    """Return a table for `new_console`: rich's, or plain text with the same methods.
+) -> Table:
+    """Return a table for `new_console`.
 
     Parameters
     ----------
@@ -52,21 +54,20 @@ def new_table(
     texts, figures, notes
         Headings of the columns: texts on the left, then figures, aligned right, then further texts.
     whole
-        Number of columns, from the left, whose cells rich does not wrap.
+        Number of columns, from the left, whose cells are not wrapped.
     """
-    if has_rich():
-        from rich.table import Table
+    columns = [Column(heading, False, k < whole, True) for k, heading in enumerate(texts)]
+    columns += [Column(heading, True, True, False) for heading in figures]
+    return Table(title, columns + [Column(heading, False, False, False) for heading in notes])
 
-        table: Any = Table(title=title, title_justify="left")
-    else:
-        table = _PlainTable(title)
-    for index, heading in enumerate(texts):
-        table.add_column(heading, no_wrap=index < whole)
-    for heading in figures:
-        table.add_column(heading, justify="right")
-    for heading in notes:
-        table.add_column(heading)
-    return table
+
+class Column(NamedTuple):
+    """A column: its heading, alignment, whether its cells stay whole, whether it names the row."""
+
+    heading: str
+    right: bool
+    whole: bool
+    name: bool
 
 
 class _PlainConsole:
@@ -77,39 +78,92 @@ class _PlainConsole:
         print(*shown)
 
 
-class _PlainTable:
-    """Columns, rows and sections as in rich's `Table`; `str` gives the text."""
+class Table:
+    """Columns, rows and sections; rich draws them with lines, `str` as plain text.
 
-    def __init__(self, title: str | None) -> None:
-        self._title = title
-        self._headings: list[str] = []
-        self._right: list[bool] = []
-        self._rows: list[tuple[str, ...] | None] = []  # None: a section ends
+    A table that is too wide for the terminal is split into parts, one below the other. Each part
+    begins with the columns that name the row.
+    """
 
-    def add_column(self, heading: str, justify: str = "left", **_style: Any) -> None:
-        """Add a column, aligned left or right."""
-        self._headings.append(heading)
-        self._right.append(justify == "right")
+    def __init__(self, title: str | None, columns: list[Column]) -> None:
+        self._title, self._columns = title, columns
+        self._rows: list[tuple[tuple[str, ...], str | None] | None] = []  # None: a section ends
 
-    def add_row(self, *cells: str, **_style: Any) -> None:
+    def add_row(self, *cells: str, style: str | None = None) -> None:
         """Add a row; trailing cells may be missing."""
-        self._rows.append((*cells, *[""] * (len(self._headings) - len(cells))))
+        missing = len(self._columns) - len(cells)
+        self._rows.append(((*cells, *[""] * missing), style))
 
     def add_section(self) -> None:
         """Add a line below the rows so far."""
         self._rows.append(None)
 
     def __str__(self) -> str:
-        rows = [tuple(self._headings), *(row for row in self._rows if row)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        line = "  ".join("-" * width for width in widths)
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+        widths = [max(map(len, self._cells(k))) for k in range(len(self._columns))]
+        parts = [self._plain(part, widths) for part in self._parts(widths, width, 2)]
+        return "\n".join([self._title, *parts] if self._title else parts)
 
-        def text(row: tuple[str, ...]) -> str:
-            cells = zip(row, widths, self._right, strict=True)
-            return "  ".join(c.rjust(w) if right else c.ljust(w) for c, w, right in cells).rstrip()
+    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
+        """Yield the parts as tables of rich."""
+        from rich.table import Table as RichTable
 
-        body = [line if row is None else text(row) for row in self._rows]
+        least = [self._least(k) for k in range(len(self._columns))]
+        title = self._title
+        for part in self._parts(least, options.max_width - 1, 3):
+            spare = options.max_width - 1 - sum(least[k] + 3 for k in part)
+            table: Any = RichTable(title=title, title_justify="left")
+            for k in part:
+                wanted = max(map(len, self._cells(k)))
+                width = max(least[k] + min(spare, wanted - least[k]), 1)
+                spare = max(spare - width + least[k], 0)
+                justify = "right" if self._columns[k].right else "left"
+                table.add_column(
+                    self._columns[k].heading, justify=justify, width=width, overflow="fold"
+                )
+            for row in self._rows:
+                if row is None:
+                    table.add_section()
+                else:
+                    table.add_row(*(row[0][k] for k in part), style=row[1])
+            yield table
+            title = None
+
+    def _least(self, k: int) -> int:
+        """Return the smallest width of a column in which no word, or no whole cell, is broken."""
+        heading, *cells = self._cells(k)
+        pieces = heading.split()
+        for cell in cells:
+            pieces += [cell] if self._columns[k].whole else cell.split()
+        return max(map(len, pieces), default=0)
+
+    def _cells(self, k: int) -> list[str]:
+        """Return heading and cells of a column."""
+        return [self._columns[k].heading, *(row[0][k] for row in self._rows if row)]
+
+    def _parts(self, widths: list[int], most: int, between: int) -> list[list[int]]:
+        """Return the columns of each part, given their widths and the space between them."""
+        names = [k for k, column in enumerate(self._columns) if column.name]
+        parts, used = [names], sum(widths[k] + between for k in names)
+        of_names = used
+        for k in range(len(names), len(self._columns)):
+            used += widths[k] + between
+            if used > most and len(parts[-1]) > len(names):
+                parts, used = [*parts, names], of_names + widths[k] + between
+            parts[-1] = [*parts[-1], k]
+        return parts
+
+    def _plain(self, part: list[int], widths: list[int]) -> str:
+        line = "  ".join("-" * widths[k] for k in part)
+
+        def text(cells: Sequence[str]) -> str:
+            put = (
+                cells[k].rjust(widths[k]) if self._columns[k].right else cells[k].ljust(widths[k])
+                for k in part
+            )
+            return "  ".join(put).rstrip()
+
+        body = [line if row is None else text(row[0]) for row in self._rows]
         while body and body[-1] is line:
             body.pop()
-        title = [self._title] if self._title else []
-        return "\n".join([*title, text(rows[0]), line, *body, ""])
+        return "\n".join([text([column.heading for column in self._columns]), line, *body, ""])

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.bounds.information import range_information
+from rbl_gym.bounds.motions import KnownTwist, UnknownTwist
+from rbl_gym.bounds.nuisances import RangeEpoch
 from rbl_gym.bounds.tridiagonal import inverse_blocks
 from rbl_gym.checks import FloatArray, check_array, kernel
 from rbl_gym.geometry import rotations
-from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import ProcessNoise, check_process
 from rbl_gym.motion.unknown_twist import WanderingTwist, check_laws
 
@@ -28,64 +29,48 @@ _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 def smoothing_crb(
-    anchors: ArrayLike,
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: ranging.NoiseLaw,
-    twists: ArrayLike,
-    dt: ArrayLike,
-    process: ProcessNoise,
+    epochs: RangeEpoch,
+    motion: KnownTwist | UnknownTwist,
     prior_covariance: ArrayLike,
-    links: ArrayLike | None = None,
-    law: WanderingTwist | None = None,
     offset: str | None = None,
 ) -> FloatArray:
     """Return the Cramer-Rao bound of the poses of K epochs from all ranges, at the true poses.
 
     Parameters
     ----------
-    anchors, tags
-        (M, 3), or (..., K, M, 3) if they move, and (N, 3), metres.
-    rotation, translation
-        True poses (..., K, 3, 3) and (..., K, 3).
-    noise
-        Noise law of the ranges.
-    twists
-        True twists (..., K - 1, 6) of the intervals between epochs, rad/s and m/s.
-    dt
-        Lengths of the intervals, a number or (..., K - 1) seconds.
-    process
-        Process noise.
+    epochs
+        The ranges of all epochs: rotations (..., K, 3, 3), translations (..., K, 3), links
+        (..., K, M, N), anchors (M, 3), or (..., K, M, 3) if they move.
+    motion
+        Motion in the intervals between epochs: true twists (..., K - 1, 6), and their lengths `dt`,
+        a number or (..., K - 1) seconds.
     prior_covariance
         (..., 6, 6), prior of the pose at the first epoch.
-    links
-        (..., K, M, N), True where a range is measured; None: all.
-    law
-        Law of an unknown twist; None: the twist is known.
     offset
         Which ranges share an unknown offset, independent at every epoch, as in
         `range_information`.
 
     Returns
     -------
-    Covariances (..., K, 6, 6) of the pose error; with a law (..., K, 12, 12) of pose and twist,
-    as in `bounds.UnknownTwist`.
+    Covariances (..., K, 6, 6) of the pose error; with `UnknownTwist` (..., K, 12, 12) of pose and
+    twist.
 
     Raises
     ------
     ValueError
         If a shape or value is wrong.
     """
-    twists = check_array("twists", twists, ("K", 6))
-    dt = np.broadcast_to(check_array("dt", dt, ()), twists.shape[:-1])
+    twists = check_array("twist", motion.twist, ("K", 6))
+    dt = np.broadcast_to(check_array("dt", motion.dt, ()), twists.shape[:-1])
     if (dt < 0).any():
         raise ValueError(f"dt must not be negative, got {dt.min()}")
-    check_process(process)
-    if law is not None:
+    check_process(motion.process)
+    law, sensor, process = None, None, motion.process
+    if isinstance(motion, UnknownTwist):
+        law, sensor = motion.law, motion.sensor
         check_laws(law, process)
     P = check_array("prior_covariance", prior_covariance, (6, 6))
-    seen = range_information(anchors, tags, rotation, translation, noise, links, offset=offset)
+    seen = range_information(*epochs, offset=offset)
     n = 6 if law is None else 12
     F, Q = _transition(twists, dt, process, law)
     weight, Ft = np.linalg.inv(Q), np.swapaxes(F, -1, -2)
@@ -93,7 +78,7 @@ def smoothing_crb(
     K = seen.shape[-3]
     if F.shape[-3] != K - 1:
         raise ValueError(
-            f"twists must have {K - 1} entries, one for each interval between the {K} epochs, got "
+            f"twist must have {K - 1} entries, one for each interval between the {K} epochs, got "
             f"{F.shape[-3]}"
         )
     diagonal, above = np.zeros((*batch, K, n, n)), np.zeros((*batch, K, n, n))
@@ -102,6 +87,8 @@ def smoothing_crb(
     if law is not None:
         std = np.maximum(law.prior_std(), LEAST_STD)
         diagonal[..., 0, range(6, 12), range(6, 12)] += std**-2.0
+    if sensor is not None:
+        diagonal[..., :-1, :, :] += sensor.information(twists)
     diagonal[..., :-1, :, :] += Ft @ weight @ F
     diagonal[..., 1:, :, :] += weight
     above[..., :-1, :, :] = -Ft @ weight

@@ -38,7 +38,12 @@ def enabled() -> bool:
         importlib.import_module("numba")
     except ImportError as error:
         # numba does not support versions of NumPy that are newer than itself.
-        warnings.warn(f"numba does not import, kernels are off: {error}", stacklevel=2)
+        warnings.warn(
+            "compiled kernels are off and calculations are slower: numba is installed but cannot "
+            f"be imported ({error}). Install versions of numba and numpy that fit together, or set "
+            "RBL_GYM_COMPILED=0 to hide this warning.",
+            stacklevel=2,
+        )
         return False
     return True
 

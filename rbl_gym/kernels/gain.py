@@ -1,4 +1,4 @@
-"""Information fraction of links by range and angle; the textbook form is `placement.gain`."""
+"""Information fraction of links by range and angle; textbook form: `measurements.gain`."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.bags import convert_bag, list_topics, show_message
 from rbl_gym.recordings.directions import read_directions
-from rbl_gym.recordings.format import Format
+from rbl_gym.recordings.format import Files, Format
 from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial, samples_between
 from rbl_gym.recordings.motion_offset import motion_offset
 from rbl_gym.recordings.odometry import OdometryLog, odometry_between, read_odometry
@@ -17,6 +17,7 @@ from rbl_gym.recordings.writing import TrackFile, check_track_path, read_track, 
 __all__ = [
     "ALIGNMENTS",
     "Alignment",
+    "Files",
     "Format",
     "InertialLog",
     "OdometryLog",

@@ -9,7 +9,6 @@ Errors in a file raise a ValueError that names the file, the line, the column an
 from __future__ import annotations
 
 import os
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,14 +16,14 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.measurements.inertial import turned
 from rbl_gym.recordings.calibration import calibrated
 from rbl_gym.recordings.directions import read_directions
-from rbl_gym.recordings.format import Format
+from rbl_gym.recordings.format import Files, Format
 from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial
 from rbl_gym.recordings.odometry import read_odometry
 from rbl_gym.recordings.points import read_points
 from rbl_gym.recordings.ranges import Log, read_log
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.recordings.report import Said
-from rbl_gym.recordings.tables import AnyPath, Table, read_table
+from rbl_gym.recordings.tables import Table, read_table
 from rbl_gym.recordings.truth import Truth, read_truth, truth_at
 from rbl_gym.recordings.units import check_units
 
@@ -35,78 +34,19 @@ _AS_DESCRIBED = Format()
 _CARRIER_GAP_S = 1.0
 
 
-class _Files(NamedTuple):
-    ranges: AnyPath
-    anchors: AnyPath | None
-    tags: AnyPath | None
-    truth: AnyPath | None
-    calibration: AnyPath | None
-    carrier: AnyPath | None
-    relative: bool
-    odometry: AnyPath | None = None
-    imu: AnyPath | None = None
-    imu_frame: AnyPath | None = None
-    directions: AnyPath | None = None
-
-
 def read_recording(
-    ranges: AnyPath,
-    anchors: AnyPath | None = None,
-    tags: AnyPath | None = None,
-    truth: AnyPath | None = None,
-    calibration: AnyPath | None = None,
-    *,
-    carrier: AnyPath | None = None,
-    relative: bool = False,
-    odometry: AnyPath | None = None,
-    imu: AnyPath | None = None,
-    imu_frame: AnyPath | None = None,
-    directions: AnyPath | None = None,
-    run: str | None = None,
-    format: Format = _AS_DESCRIBED,
+    files: Files, run: str | None = None, format: Format = _AS_DESCRIBED
 ) -> Recording:
     """Read a measurement log from its files.
 
     Parameters
     ----------
-    ranges
-        Long, ``t,anchor,tag,range[,std or var][,valid][,run]``: rows with equal `t` form an epoch.
-        If `valid` (0 or 1) is 0, range and std may be any number or empty. Or wide,
-        ``t,a{anchor}t{tag},...``: a row is an epoch. Seconds and metres. A link is missing if its
-        range is empty, or if it has no row or column. Without `anchors`, every row holds the
-        position of the anchor: ``ax,ay[,az]``. Or differences of the distances to two anchors,
-        ``t,anchor_a,anchor_b,tag,difference[,std or var]``, the distance to `anchor_a` minus the
-        distance to `anchor_b`. They become ranges with one unknown offset per tag.
-    anchors, tags
-        ``anchor,x,y,z`` and ``tag,x,y,z`` (or ``id,x,y,z``), metres; ids are any unique text.
-        Moving anchors have a row for every position and time: ``anchor,t,x,y,z``. Without `tags`
-        there is one tag, at the origin of the body frame.
-    truth
-        File for `rbl_gym.recordings.read_truth`: ``t,x,y,z,qw,qx,qy,qz``, TUM, EuRoC/ASL,
-        positions with a heading, or positions only.
-    calibration
-        ``anchor,tag,bias_m[,slope][,sigma_m]``: ``(range - bias) / (1 + slope)`` replaces the
-        range of that link and ``std / (1 + slope)`` its std. A corrected range that is not
-        positive becomes a missing link. Links without a row are unchanged; `sigma_m` is not read.
-    carrier
-        Poses of a body that carries the anchors, in the formats of `truth`. `anchors` is then in
-        the frame of this body. May be the file of the ranges.
-    relative
-        Estimate the pose in the frame of the `carrier`. The anchors are fixed in this frame, and
-        the truth is taken relative to it.
-    odometry
-        File for `rbl_gym.recordings.read_odometry`: ``t,vx,vy,vz,wx,wy,wz``, or the speeds of two
-        wheels.
-    imu, imu_frame
-        File for `rbl_gym.recordings.read_inertial`, ``t,wx,wy,wz,ax,ay,az``, and the argument of
-        `read_frame`: the rotation from its axes to those of the body.
-    directions
-        File for `rbl_gym.recordings.read_directions`: bias by the direction of the ray at its ends.
-        It becomes part of the measurement model; the ranges are not corrected.
+    files
+        The files, such as ``Files("ranges.csv", "anchors.csv", "tags.csv", truth="truth.csv")``.
     run
         The run to read, if the file holds several (column `run`); see `read_runs`.
     format
-        The format of the files, if it differs from the above.
+        Differences of the files from the form that `Files` describes.
 
     Returns
     -------
@@ -122,13 +62,7 @@ def read_recording(
         not fit together, or no epoch has a link. With `format.strict`, also at the first range or
         row that would be dropped or sorted.
     """
-    files = _Files(
-        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
-        directions,
-    )  # fmt: skip
-    said = Said()
-    table = read_table(ranges, format.of("ranges"))
-    runs = _runs_of(table)
+    table, runs = _runs_of(files, format)
     if run is None and len(runs) > 1:
         raise ValueError(
             f"{table.path}: has {len(runs)} runs, {[*runs]!r:.200}; choose one with run, or read "
@@ -138,62 +72,41 @@ def read_recording(
         if run not in runs:
             raise ValueError(f"{table.path}: has no run {run!r}, got {[*runs]!r:.200}")
         table = table.select(runs[run])
-    return _read(files, table, run, format, said)
+    return _read(files, table, run, format)
 
 
-def read_runs(
-    ranges: AnyPath,
-    anchors: AnyPath | None = None,
-    tags: AnyPath | None = None,
-    truth: AnyPath | None = None,
-    calibration: AnyPath | None = None,
-    *,
-    carrier: AnyPath | None = None,
-    relative: bool = False,
-    odometry: AnyPath | None = None,
-    imu: AnyPath | None = None,
-    imu_frame: AnyPath | None = None,
-    directions: AnyPath | None = None,
-    format: Format = _AS_DESCRIBED,
-) -> dict[str, Recording]:
+def read_runs(files: Files, format: Format = _AS_DESCRIBED) -> dict[str, Recording]:
     """Read the runs of a log, each as a recording, keyed by column `run` in the order of the file.
 
     Arguments as in `read_recording`, with the same errors. A log without this column is one run
     with the name ``""``. If the truth has this column too, each run has its own truth. A truth
     without time and with a single pose per run belongs to a body at rest.
     """
-    files = _Files(
-        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
-        directions,
-    )  # fmt: skip
-    table = read_table(ranges, format.of("ranges"))
-    runs = _runs_of(table)
+    table, runs = _runs_of(files, format)
     return {
-        run: _read(files, table if rows.all() else table.select(rows), run or None, format, Said())
+        run: _read(files, table if rows.all() else table.select(rows), run or None, format)
         for run, rows in runs.items()
     }
 
 
-def _runs_of(table: Table) -> dict[str, np.ndarray]:
-    """Return the rows (rows,) of each run."""
+def _runs_of(files: Files, format: Format) -> tuple[Table, dict[str, np.ndarray]]:
+    """Return the table of ranges, and the rows (rows,) of each run."""
+    if not isinstance(files, Files):
+        raise TypeError(f"files must be recordings.Files(ranges, anchors, ...), got {files!r:.80}")
+    table = read_table(files.ranges, format.of("ranges"))
     if "run" not in table.columns:
-        return {"": np.ones(len(table.lines), dtype=bool)}
+        return table, {"": np.ones(len(table.lines), dtype=bool)}
     names = np.array(table.text("run"))
-    return {name: names == name for name in dict.fromkeys(names.tolist())}
+    return table, {name: names == name for name in dict.fromkeys(names.tolist())}
 
 
-def _read(files: _Files, table: Table, run: str | None, format: Format, said: Said) -> Recording:
+def _read(files: Files, table: Table, run: str | None, format: Format) -> Recording:
     """Read one run."""
+    said = Said()
     anchors, tags = (
         None if path is None else read_points(path, kind, format.of(f"{kind}s"), said)
         for kind, path in (("anchor", files.anchors), ("tag", files.tags))
     )
-    if files.carrier is not None and anchors is None:
-        raise ValueError(
-            "carrier needs anchors: a table of the anchors in the frame of the carrier"
-        )
-    if files.relative and files.carrier is None:
-        raise ValueError("relative needs a carrier")
     log = read_log(table, anchors, tags, format, said)
     ids = log.anchors.ids, log.tags.ids
     if files.calibration is not None:
@@ -224,7 +137,9 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
     links = log.links
     if not links.any():
         raise ValueError(f"{table.path}: must have at least one usable range, got none")
-    paths = [table.path if p is None else os.fspath(p) for p in files[:3]]
+    paths = [
+        table.path if p is None else os.fspath(p) for p in (files.ranges, files.anchors, files.tags)
+    ]
     how = "carried" if files.carrier else "stand" if log.anchors.tracks is None else "move"
     points = log.anchors.places, log.tags.places
     if log.offset is None:
@@ -235,11 +150,9 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
     )  # fmt: skip
 
 
-def _inertial(files: _Files, format: Format) -> InertialLog | None:
+def _inertial(files: Files, format: Format) -> InertialLog | None:
     """Return the readings of the inertial sensor in body axes."""
     if files.imu is None:
-        if files.imu_frame is not None:
-            raise ValueError("imu_frame needs imu")
         return None
     columns = dict(format.of("imu").columns)
     log = read_inertial(files.imu, columns=columns, turn_unit=format.turn_unit)

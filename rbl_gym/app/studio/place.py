@@ -73,7 +73,7 @@ class PlacePage:
             "undo": lambda: self.edit(state.undo),
             "redo": lambda: self.edit(state.redo),
             "add": lambda: self._edit_and_select(state.add),
-            "add_best": lambda: self._edit_and_select(searches.add_best),
+            "add_best": lambda: self._edit_and_select(lambda at: searches.add_best(at, self._seed)),
             "remove": lambda: self._of_selected(state.remove),
             "fix": lambda: self._of_selected(lambda now, k: state.fix(now, k, not now.fixed[k])),
             "optimise": self.optimise,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.measurements.ranging import LinkModel
-from rbl_gym.recordings import Recording, read_recording
+from rbl_gym.recordings import Files, Recording, read_recording
 from rbl_gym.studies import replay
 from rbl_gym.studies.bench import figures
 from rbl_gym.studies.bench.worlds import (
@@ -67,7 +67,7 @@ def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...
     """Load the recording of a checked mapping; the stamps identify files that have changed."""
     spec = dict(items)
     paths = {key: spec[key] for key in FILES if key in spec}
-    recording = read_recording(**paths)
+    recording = read_recording(Files(**paths))
     settings = replay.Settings.of(**{key: spec[key] for key in SETTINGS if key in spec})
     # The offset is fixed here, because a condition may change the height of an anchor.
     offset = replay.height_offset(recording, settings)

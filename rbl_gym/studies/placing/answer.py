@@ -28,6 +28,7 @@ from rbl_gym.studies.placing.judging import (
     short_row,
     zone_row,
 )
+from rbl_gym.studies.placing.out_of_plane import exchange_out_of_plane
 from rbl_gym.studies.placing.surveys import survey_rows
 from rbl_gym.studies.progress import Advance, silent
 
@@ -199,6 +200,8 @@ def _result(
     seed, survive, anchors = question.seed, question.survive, found.anchors
     low, high = problem.corners()
     edges = [at_edges(problem, anchors, one) for one in judged]
+    rows = _anchors(problem, question, anchors, judged)
+    names = [row["name"] for row in rows]
     result: dict[str, Any] = {
         "scene": problem.name,
         "seed": seed,
@@ -210,9 +213,10 @@ def _result(
         "obstacles": _obstacles(problem),
         "tags_m": problem.tags.tolist(),
         "method": found.method,
-        "anchors": _anchors(problem, question, anchors, judged),
+        "anchors": rows,
         "cost": float(problem.mounts.cost(anchors).sum()),
         "coplanar": _is_flat(anchors),
+        "out_of_plane": _out_of_plane(problem, anchors, names, judged, seed, survive),
         "next_anchor": _next(problem, anchors, judged, seed, survive),
         "predicted": overview(judged, edges),
         "survey": survey_rows(problem, anchors, judged),
@@ -291,18 +295,40 @@ def _next(
 ) -> dict[str, Any] | None:
     """Return the best position of one more anchor, and the accuracy with it."""
     found = choosing.next_anchor(problem, anchors, seed, survive)
+    return None if found is None else _with_anchor(problem, *found, judged)
+
+
+def _out_of_plane(
+    problem: Problem,
+    anchors: FloatArray,
+    names: list[str],
+    judged: list[Judged],
+    seed: int,
+    survive: int,
+) -> dict[str, Any] | None:
+    """Return the best exchange of one anchor after which the anchors are not coplanar."""
+    found = exchange_out_of_plane(problem, anchors, seed, survive) if _is_flat(anchors) else None
     if found is None:
         return None
-    place, more = found
+    index, place = found
+    moved = np.where(np.arange(len(anchors))[:, None] == index, place, anchors)
+    after = judge(problem, moved, seed, survive, PLACES)
+    return {"anchor": names[index], **_with_anchor(problem, place, after, judged)}
+
+
+def _with_anchor(
+    problem: Problem, place: FloatArray, after: list[Judged], judged: list[Judged]
+) -> dict[str, Any]:
+    """Return a new position of an anchor, and the accuracy with it and without it."""
     now = [one.first() for one in judged]
     return {
         **dict(zip(("x_m", "y_m", "z_m"), place.tolist(), strict=True)),
         "mount": problem.mounts.names(place[None])[0],
         "cost": float(problem.mounts.cost(place[None])[0]),
-        "verdict": verdict(more),
-        "score_m": _overall(more),
-        "ratio": _overall(more) / _overall(now),
-        "zones": [short_row(one) for one in more],
+        "verdict": verdict(after),
+        "score_m": _overall(after),
+        "ratio": _overall(after) / _overall(now),
+        "zones": [short_row(one) for one in after],
         "zones_now": [short_row(one) for one in now],
     }
 

@@ -149,7 +149,7 @@ def improved(
     reached = math.inf
     listed = problem.mounts.listed() is not None
     for reach in (None,) if listed else (None, *_REACHES):
-        points = _first(anchors, _around(problem, rng, anchors, reach))
+        points = first_then_others(anchors, _around(problem, rng, anchors, reach))
         stock = stock_of(problem, points, seed)
         chosen, reached = swapped(stock, range(len(anchors)), len(problem.fixed), survive)
         anchors = points[chosen]
@@ -169,7 +169,7 @@ def _around(
     return np.concatenate([_legal(problem, near), far])
 
 
-def _first(anchors: FloatArray, points: FloatArray) -> FloatArray:
+def first_then_others(anchors: FloatArray, points: FloatArray) -> FloatArray:
     """Return the anchors, then the points that are not among them."""
     known = (np.abs(points[:, None] - anchors).max(axis=-1) < 1e-9).any(axis=1)
     return np.concatenate([anchors, points[~known]])
@@ -216,7 +216,7 @@ def fewest_anchors(
         )
     keep = len(problem.fixed)
     rng = np.random.default_rng([seed, 6])
-    points = _first(problem.fixed, candidates(problem, rng))
+    points = first_then_others(problem.fixed, candidates(problem, rng))
     stock = stock_of(problem, points, seed)
     plain = stock._replace(zones=tuple(z._replace(limits=Limits()) for z in stock.zones))
     path = _growth(stock, keep, numbers[-1], survive)
@@ -300,7 +300,7 @@ def _cheapened(
 ) -> tuple[FloatArray, list[Judged]]:
     """Return the layout after exchanges that save cost and still meet the requirements."""
     rng = np.random.default_rng([seed, 7])
-    points = _first(anchors, candidates(problem, rng))
+    points = first_then_others(anchors, candidates(problem, rng))
     stock = stock_of(problem, points, seed)
     if np.ptp(stock.cost) == 0:
         return anchors, judged
@@ -327,7 +327,7 @@ def next_anchor(
         As in `improved`.
     """
     rng = np.random.default_rng([seed, 8])
-    points = _first(anchors, candidates(problem, rng))
+    points = first_then_others(anchors, candidates(problem, rng))
     if len(points) == len(anchors):
         return None
     stock = stock_of(problem, points, seed, _LEAST_PLACES)

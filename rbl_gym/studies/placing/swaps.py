@@ -192,7 +192,7 @@ def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
             others = found[:k] + found[k + 1 :]
             less = stock.cost < stock.cost[found[k]] - 1e-12
             which = np.setdiff1d(np.flatnonzero(less), found)
-            scores = _with_candidates(stock, others, which, survive, 1 + 1e-12)
+            scores = with_candidates(stock, others, which, survive, 1 + 1e-12)
             good = np.flatnonzero(scores <= 1)
             if len(good):
                 order = np.lexsort((scores[good], stock.cost[which[good]]))
@@ -258,15 +258,15 @@ def _best_added(
     """Return the candidate that improves the layout `others` most, and the value with it."""
     which = np.setdiff1d(np.arange(len(stock.cost)), others)
     if len(which) > _TRIED:
-        rough = _with_candidates(coarse, others, None, survive, math.inf, _WORST_LOSSES)
+        rough = with_candidates(coarse, others, None, survive, math.inf, _WORST_LOSSES)
         rough[others] = math.inf
         which = np.argpartition(rough, _TRIED)[:_TRIED]
-    scores = _with_candidates(stock, others, which, survive, limit)
+    scores = with_candidates(stock, others, which, survive, limit)
     best = int(scores.argmin())
     return int(which[best]), float(scores[best])
 
 
-def _with_candidates(
+def with_candidates(
     stock: Stock,
     others: list[int],
     which: np.ndarray | None,

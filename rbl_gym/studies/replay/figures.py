@@ -19,7 +19,7 @@ from rbl_gym.studies.replay.judging import (
     truth_of,
 )
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
-from rbl_gym.studies.replay.observed import rank_figures
+from rbl_gym.studies.replay.observed import known_figures
 from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.smoothing import SmoothedRecording
@@ -134,7 +134,7 @@ def _with_reading(recording: Recording, notes: list[str]) -> dict[str, Any]:
 def _notes(
     recording: Recording, track: Track, found: TrackErrors | None, settings: Settings
 ) -> dict[str, Any]:
-    """Return the figures of the mirror pose and the rank, and notes for the reader."""
+    """Return the figures of the mirror pose and of known directions, and notes for the reader."""
     result: dict[str, Any] = {}
     notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
     count = len(track.times)
@@ -147,8 +147,8 @@ def _notes(
             "log_odds": float(track.other.log_odds[alive][-1]),
         }
         notes.append(_mirror_note(result["mirror"], count))
-    rank, unknown = rank_figures(recording, track)
-    result |= rank
+    known, unknown = known_figures(recording, track)
+    result |= known
     # If there is a mirror pose, its own note is sufficient.
     notes += unknown if "mirror" not in result else []
     volume = volume_of(recording, settings)

@@ -56,11 +56,14 @@ def observed(track: Track, tags: FloatArray) -> Observed:
     )
 
 
-def rank_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], list[str]]:
-    """Return the final rank of the pose, the time since when, and notes on unknown directions."""
+def known_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], list[str]]:
+    """Return the number of known directions, since when, and notes on the unknown ones."""
     found, times = observed(track, recording.tags), track.times - track.times[0]
-    rank = found.turns + found.places
-    result: dict[str, Any] = {"rank": int(rank[-1]), "rank_since_s": _since(rank, times)}
+    known = found.turns + found.places
+    result: dict[str, Any] = {
+        "known_directions": int(known[-1]),
+        "known_directions_since_s": _since(known, times),
+    }
     notes = []
     if found.turns[-1] < 3:
         spread = np.rad2deg(found.turn_std[-1, found.turns[-1] :])

@@ -25,6 +25,14 @@ __all__ = [
 DEFAULT_RANGE_STD_M = 0.12
 # For the filter iekf-imu: lasting biases of single links cannot be separated from the common one.
 _INERTIAL_BIASES = {"constant_std_m": 0.0, "constant_common_m": 0.073, "drift_time_s": 20.0}
+# Fields that only one filter uses, or that are its motion, for `Settings.of`.
+_FILTERS_BY_FIELD = {
+    "bias_std_m": "iekf-bias",
+    "bias_time_s": "iekf-bias",
+    "bias_common_m": "iekf-bias",
+    "walk_m": "iekf",
+    "walk_deg": "iekf",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,11 +266,11 @@ class Settings:
 
     Examples
     --------
-    >>> Settings(motion=Motion(walk_m=0.3)) == Settings.of(walk_m=0.3)
+    >>> Settings("iekf", motion=Motion(walk_m=0.3)) == Settings.of(walk_m=0.3)
     True
     """
 
-    filter: str = "iekf"
+    filter: str = "iekf-log"
     filter_options: tuple[tuple[str, Any], ...] = ()
     range_std_m: float | None = None
     motion: Motion = Motion()
@@ -296,16 +304,19 @@ class Settings:
     def of(cls, **fields: Any) -> Settings:
         """Return settings with these fields, of any group.
 
-        Link biases default to those of the filter. For ``"iekf-imu"``, with an accurate motion,
-        these are a constant bias common to all links (0.073 m), and a bias of each link that
-        drifts in 20 s.
+        The filter defaults to ``"iekf-bias"`` if a field of its biases is given, else to ``"iekf"``
+        if a random walk is given, else to ``"iekf-log"``. Link biases default to those of the
+        filter. For ``"iekf-imu"``, with an accurate motion, these are a constant bias common to all
+        links (0.073 m), and a bias of each link that drifts in 20 s.
 
         Raises
         ------
         ValueError
             If a field is unknown, or a value is invalid for its group.
         """
-        inertial = parse_filter(fields.get("filter", ""))[0] == "iekf-imu"
+        wanted = [name for field, name in _FILTERS_BY_FIELD.items() if field in fields]
+        fields = {"filter": (*wanted, "iekf-log")[0], **fields}
+        inertial = parse_filter(fields["filter"])[0] == "iekf-imu"
         usual = _INERTIAL_BIASES if inertial else {}
         return cls().changed(**{**usual, **fields})
 
