@@ -427,7 +427,7 @@ def test_a_check_that_contradicts_the_prediction_is_told_at_the_top():
     assert "the errors of 'b' are 3.7 times the predicted ones" in warning
     assert "mirror" not in warning
     result["check"]["filters"] = {"a": good, "b": bad | {"found": 0.986}}
-    *_, warning = place_answer.warnings(result | {"coplanar": True})
+    *_, warning = place_answer.warnings(result | {"coplanar": True, "n_anchors": 3})
     assert "'b' has no pose or a wrong one for 1.4 % of the bodies; see the table" in warning
     assert warning.endswith("Probable cause: the mirror image behind the plane of the anchors.")
     # A filter that does not know the blocked links says nothing about the prediction.

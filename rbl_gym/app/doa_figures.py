@@ -95,8 +95,8 @@ def print_doa2019(result: dict[str, Any]) -> None:
                 "1",
                 f"{bound[1]:.5f}",
                 "1",
-                end_section=True,
             )
+            table.add_section()
         out.print(table)
     out.print(
         "RMSE and ratios are of the trials near the truth: both errors within 6 times the "
@@ -127,8 +127,8 @@ def _print_table_1(out: Any, result: dict[str, Any]) -> None:
                 f"{1e-6 * method['microseconds_per_trial'][k]:.2g}",
                 f"{paper['seconds'][k] / result['table_1']['NIA + UQ']['seconds'][k]:.0f}",
                 f"{method['time_ratio'][k]:.0f}",
-                end_section=name == list(result["table_1"])[-1],
             )
+        table.add_section()
     out.print(table)
 
 

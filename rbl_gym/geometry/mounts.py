@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.geometry.regions import Faced, Faces
+from rbl_gym.geometry.regions import Faces, Region
 from rbl_gym.kernels import compiled
 
 __all__ = ["Mounts"]
@@ -22,7 +22,7 @@ _LEAST_HEIGHT_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Mounts(Faced):
+class Mounts(Region):
     """A region that consists of pieces.
 
     Parameters

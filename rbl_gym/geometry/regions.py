@@ -65,8 +65,8 @@ class Faces(NamedTuple):
         return face, np.take_along_axis(distance, face[..., None], axis=-1)[..., 0]
 
 
-class Faced:
-    """Properties of the points of a region from its `faces`: a field, or computed once."""
+class Region(Protocol):
+    """Interface of regions; `faces` is a field, or computed once."""
 
     if TYPE_CHECKING:
 
@@ -98,35 +98,6 @@ class Faced:
     def listed(self) -> FloatArray | None:
         """Return all legal points (K, 3) if they are a list; None: a continuous region."""
         return None
-
-
-class Region(Protocol):
-    """Interface of regions."""
-
-    @property
-    def faces(self) -> Faces:
-        """Return the faces that contain the region."""
-        ...
-
-    def face_of(self, points: FloatArray) -> np.ndarray:
-        """Return the index (...) of the face of legal points (..., 3)."""
-        ...
-
-    def normal(self, points: FloatArray) -> FloatArray:
-        """Return the direction (..., 3) that anchors at points face; zero: all directions."""
-        ...
-
-    def cost(self, points: FloatArray) -> FloatArray:
-        """Return the cost (...) of anchors at points (..., 3)."""
-        ...
-
-    def names(self, points: FloatArray) -> list[str]:
-        """Return the names of the faces of points (M, 3)."""
-        ...
-
-    def listed(self) -> FloatArray | None:
-        """Return all legal points (K, 3) if they are a list."""
-        ...
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper corner (3,) of the bounding box."""
@@ -160,7 +131,7 @@ def _check_corners(region: Box | Walls, *, flat: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Box(Faced):
+class Box(Region):
     """A box (flat ones allowed, such as a water surface), corners in metres."""
 
     low: Triple
@@ -173,13 +144,9 @@ class Box(Faced):
         """Return the lower and upper corner; read-only."""
         return self._corners
 
-    @property
+    @functools.cached_property
     def faces(self) -> Faces:
         """Return one face, the box itself."""
-        return self._known_faces
-
-    @functools.cached_property
-    def _known_faces(self) -> Faces:
         low, high = self.bounds()
         return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "box")])
 
@@ -210,7 +177,7 @@ class Box(Faced):
 
 
 @dataclass(frozen=True)
-class Walls(Faced):
+class Walls(Region):
     """The four walls and the ceiling of a box-shaped room (no floor), corners in metres."""
 
     low: Triple
@@ -227,13 +194,9 @@ class Walls(Faced):
     def _corners(self) -> tuple[FloatArray, FloatArray]:
         return _fixed(self.low), _fixed(self.high)
 
-    @property
+    @functools.cached_property
     def faces(self) -> Faces:
         """Return the walls to the west, east, south and north, and the ceiling."""
-        return self._known_faces
-
-    @functools.cached_property
-    def _known_faces(self) -> Faces:
         low, high = self.bounds()
         names = ("west wall", "east wall", "south wall", "north wall", "ceiling")
         rows = []
@@ -319,7 +282,7 @@ def place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> Flo
 
 
 @dataclass(frozen=True)
-class Shell(Faced):
+class Shell(Region):
     """The space between two spheres about the origin, radii in metres."""
 
     inner_m: float
@@ -333,13 +296,9 @@ class Shell(Faced):
         """Return the cube around the outer sphere."""
         return np.full(3, -self.outer_m), np.full(3, self.outer_m)
 
-    @property
+    @functools.cached_property
     def faces(self) -> Faces:
         """Return one face, the cube around the outer sphere."""
-        return self._known_faces
-
-    @functools.cached_property
-    def _known_faces(self) -> Faces:
         low, high = self.bounds()
         return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "shell")])
 
