@@ -13,7 +13,7 @@ from rbl_gym import bounds, kernels
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.studies.placing import requirements as asked
-from rbl_gym.studies.placing import swaps
+from rbl_gym.studies.placing import stock_search
 
 TAGS = bodies.octahedron(0.8)
 NOISE = RangeNoise(0.1, 0.005)
@@ -40,7 +40,7 @@ def informations(anchors, places, rotation):
 def poses(rng, n_places=15, attitude="free", limits=LIMITS, share=0.8, weight=1.0):
     places = np.array([8.0, 6.0, 1.5]) * rng.random((n_places, 3)) + np.array([1, 1, 0.3])
     rotation = asked.turns(attitude, 2)
-    return swaps.ZonePoses(places, rotation, PRIOR, TAGS, limits, share, weight)
+    return stock_search.ZonePoses(places, rotation, PRIOR, TAGS, limits, share, weight)
 
 
 def mounts(rng, count=9):
@@ -56,7 +56,7 @@ def stock(seed=0, count=9, **limits):
     anchors = mounts(rng, count)
     zones = (poses(rng, **limits), poses(rng, 10, "level", **limits))
     parts = tuple(informations(anchors, zone.places, zone.rotation) for zone in zones)
-    return swaps.Stock(zones, parts, rng.integers(1, 4, count).astype(float))
+    return stock_search.Stock(zones, parts, rng.integers(1, 4, count).astype(float))
 
 
 def plain_errors(information, rotation, tags):
@@ -169,7 +169,10 @@ def test_values_are_on_the_side_of_one_that_plain_loops_say(survive):
     sides = set()
     for count in (4, 5, 7, 9):
         for chosen in ([*range(count)], [*range(9 - count, 9)]):
-            plain, found = plain_value(pool, chosen, survive), swaps.value(pool, chosen, survive)
+            plain, found = (
+                plain_value(pool, chosen, survive),
+                stock_search.value(pool, chosen, survive),
+            )
             assert (found <= 1) == (plain <= 1)
             # The mean relative error may move it by a hundredth of itself.
             assert found == pytest.approx(plain, rel=0.03)
@@ -180,9 +183,9 @@ def test_values_are_on_the_side_of_one_that_plain_loops_say(survive):
 @pytest.mark.parametrize("survive", [0, 1])
 def test_every_choice_is_tried(survive):
     pool = stock(1, 7)
-    best, least = swaps.all_choices(pool, 4, 1, survive)
+    best, least = stock_search.all_choices(pool, 4, 1, survive)
     values = {
-        chosen: swaps.value(pool, chosen, survive)
+        chosen: stock_search.value(pool, chosen, survive)
         for chosen in itertools.combinations(range(7), 4)
         if 0 in chosen
     }
@@ -194,30 +197,30 @@ def test_every_choice_is_tried(survive):
 @pytest.mark.parametrize("seed", range(4))
 def test_exchanges_come_close_to_the_best_of_all_choices(seed, survive):
     pool = stock(seed)
-    _, least = swaps.all_choices(pool, 5, 0, survive)
-    *_, (chosen, first) = swaps.grown(pool, [], 5, survive)
-    found, reached = swaps.swapped(pool, chosen, 0, survive)
+    _, least = stock_search.all_choices(pool, 5, 0, survive)
+    *_, (chosen, first) = stock_search.grown(pool, [], 5, survive)
+    found, reached = stock_search.swapped(pool, chosen, 0, survive)
     assert len(set(found)) == 5
-    assert reached == pytest.approx(swaps.value(pool, found, survive), rel=1e-9)
+    assert reached == pytest.approx(stock_search.value(pool, found, survive), rel=1e-9)
     assert least * (1 - 1e-9) <= reached <= first * (1 + 1e-9)
     assert reached <= 1.1 * least
 
 
 def test_kept_anchors_stay():
     pool = stock(2)
-    found, _ = swaps.swapped(pool, [3, 1, 7, 0], keep=2)
+    found, _ = stock_search.swapped(pool, [3, 1, 7, 0], keep=2)
     assert found[:2] == [3, 1]
-    fewer, reached = swaps.dropped(pool, [3, 1, 7, 0, 5], keep=4)
+    fewer, reached = stock_search.dropped(pool, [3, 1, 7, 0, 5], keep=4)
     assert fewer == [3, 1, 7, 0]
-    assert reached == swaps.value(pool, fewer)
+    assert reached == stock_search.value(pool, fewer)
 
 
 def test_exchanges_save_what_the_requirement_leaves_to_spare():
     pool = stock(0, limits=asked.Limits(0.2, math.inf, math.radians(9)))
-    chosen, reached = swaps.swapped(pool, [*range(7)])
+    chosen, reached = stock_search.swapped(pool, [*range(7)])
     assert reached <= 1
-    saved = swaps.cheaper(pool, chosen)
-    assert swaps.value(pool, saved) <= 1
+    saved = stock_search.cheaper(pool, chosen)
+    assert stock_search.value(pool, saved) <= 1
     assert pool.cost[saved].sum() < pool.cost[chosen].sum()
 
 
@@ -227,4 +230,4 @@ def test_without_requirements_b_is_made_small():
     for zone, part in zip(pool.zones, pool.parts, strict=True):
         F = zone.prior + part[[0, 3, 4, 8]].sum(axis=0)
         squares.append(np.mean([plain_errors(f, zone.rotation, TAGS)[2] ** 2 for f in F]))
-    assert swaps.value(pool, [0, 3, 4, 8]) == pytest.approx(np.sqrt(np.mean(squares)))
+    assert stock_search.value(pool, [0, 3, 4, 8]) == pytest.approx(np.sqrt(np.mean(squares)))

@@ -14,7 +14,7 @@ from rbl_gym.studies.placing.accuracy import draw_places
 from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
 from rbl_gym.studies.placing.links import anchor_information
 from rbl_gym.studies.placing.requirements import Limits, turns
-from rbl_gym.studies.placing.swaps import (
+from rbl_gym.studies.placing.stock_search import (
     Stock,
     ZonePoses,
     all_choices,
@@ -131,7 +131,7 @@ def is_met(judged: list[Judged]) -> bool:
 def improved(
     problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
 ) -> tuple[FloatArray, float]:
-    """Improve a layout (M, 3) by exchanges; return it and its value (`swaps.value`).
+    """Improve a layout (M, 3) by exchanges; return it and its value (`stock_search.value`).
 
     One anchor at a time is exchanged for candidates everywhere, then near and far. The fixed
     anchors of the problem, the first ones, are kept.

@@ -16,7 +16,7 @@ from rbl_gym.geometry.mirror import plane_of
 from rbl_gym.measurements.ranging import distances
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing.choosing import candidates, first_then_others, stock_of
-from rbl_gym.studies.placing.swaps import with_candidates
+from rbl_gym.studies.placing.stock_search import with_candidates
 
 __all__ = ["exchange_out_of_plane"]
 
