@@ -202,6 +202,8 @@ def update_augmented(
     iterations: int,
     loss: FloatArray,
     n_twist: int,
+    offset: str | None = None,
+    sums: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the most likely pose of an epoch near a start, and the other states given it.
 
@@ -220,40 +222,16 @@ def update_augmented(
         (5,), of the innovations whitened by their full covariance.
     n_twist
         Number of extra states that are not biases.
+    offset
+        Which ranges share an unknown offset; the kernel does not take it.
+    sums
+        (..., M N, K), the derivative of the ranges by the extra states, if these are not biases of
+        single links; the kernel does not take it.
 
     Returns
     -------
     The fields of the state. The covariance is NaN if the information about the pose is not
     positive definite.
-    """
-    return update_any(
-        rotation, translation, extra, covariance, ranges, weights, anchors, tags, start_rotation,
-        start_translation, start_covariance, iterations, loss, n_twist, None,
-    )  # fmt: skip
-
-
-def update_any(
-    rotation: FloatArray,
-    translation: FloatArray,
-    extra: FloatArray,
-    covariance: FloatArray,
-    ranges: FloatArray,
-    weights: FloatArray,
-    anchors: FloatArray,
-    tags: FloatArray,
-    start_rotation: FloatArray,
-    start_translation: FloatArray,
-    start_covariance: FloatArray,
-    iterations: int,
-    loss: FloatArray,
-    n_twist: int,
-    offset: str | None,
-    sums: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Run `update_augmented` on ranges that may share an unknown `offset`.
-
-    `sums` (..., M N, K) is the derivative of the ranges by the extra states, if these are not
-    biases of single links.
     """
     n_links = ranges.shape[-2] * ranges.shape[-1]
     if sums is None:

@@ -20,7 +20,7 @@ from rbl_gym import bounds
 from rbl_gym.bounds.twist import covariance_after
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.costs import bias_cost
-from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_any, update_augmented
+from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.filter import PoseBelief
@@ -213,7 +213,7 @@ class AugmentedEkf:
         )  # fmt: skip
         if self.offset is None:
             return AugmentedState(*update_augmented(*epoch))
-        return AugmentedState(*update_any(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
+        return AugmentedState(*update_augmented.textbook(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
 
     def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:
         """Return the state extended by the biases of (M, N) links."""

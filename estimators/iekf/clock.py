@@ -135,7 +135,7 @@ class ClockEkf(AugmentedEkf):
         here = _DISTANCES(anchors, _TAG_POSITIONS(*start, self.pose.tags))
         state = self._with_clocks(state, ranges - here, there)
         found = AugmentedState(
-            *bias_cost.update_any(
+            *bias_cost.update_augmented.textbook(
                 *state, ranges, np.where(there, 1 / variance, 0.0), anchors, self.pose.tags,
                 *start, pose.covariance, self.pose.iterations, LOSSES[self.pose.robust],
                 self._n_twist, None, self._sums(ranges.shape[-2:]),

@@ -102,7 +102,7 @@ class SurveyedEkf(AugmentedEkf):
             point[..., self._n_twist :] = found.extra[..., self._n_twist :]
             prior = state._replace(extra=state.extra - point)
             found = AugmentedState(
-                *bias_cost.update_any(
+                *bias_cost.update_augmented.textbook(
                     *prior, ranges, weights, places, tags, *at, pose.covariance,
                     self.pose.iterations, LOSSES[self.pose.robust], self._n_twist, self.offset,
                     self._sums(places, *at),

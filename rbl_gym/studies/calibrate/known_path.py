@@ -11,6 +11,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.calibration import KnownPath, spread_of_residuals
 from rbl_gym.estimators.calibration.clock import Clock, find_clock
 from rbl_gym.estimators.calibration.link_equations import carried_tags, directions
+from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import truth_at
 from rbl_gym.recordings.recording import Recording
@@ -126,22 +127,10 @@ def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
     if settings.planar:
         turns = rotations.exp(np.linspace(0, 2 * np.pi, 24, False)[:, None] * [0.0, 0.0, 1.0])
     else:
-        turns = _cube()
+        turns = ROTATION_NET
     found = [misfit(turn) for turn in turns]
     best = int(np.argmin(found))
     return turns[best] if found[best] < _BETTER * found[0] else np.eye(3)
-
-
-def _cube() -> FloatArray:
-    """Return the 24 rotations (24, 3, 3) of a cube, the identity first."""
-    quarter = rotations.exp(0.5 * np.pi * np.eye(3))
-    found = [np.eye(3)]
-    for rotation in found:
-        for turn in quarter:
-            new = np.round(turn @ rotation)
-            if not any(np.array_equal(new, old) for old in found):
-                found.append(new)
-    return np.array(found)
 
 
 def clock_of(log: Log, settings: LinkSettings, tags: FloatArray) -> Clock | None:
