@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rbl_gym import bounds
@@ -21,11 +20,8 @@ from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
-    assert_memory_is_not_shared,
     assert_steps_alike,
-    assert_twins_go_on_alike,
     of_its_spec,
-    peer_of,
 )
 
 ID = "rbl_gym:RBL/BaseStation-v0"
@@ -42,26 +38,6 @@ DRAWN: list[Any] = [
 WORLDS["drawn"] = {"scenes": DRAWN}
 WORLDS["drawn, coarse"] = {"scenes": DRAWN, "angle_std_rad": 0.05, "reward": "none"}
 every_world = pytest.mark.parametrize("kind", WORLDS)
-
-
-@every_world
-def test_gymnasiums_checker_has_no_complaint(kind):
-    check_env(gym.make(ID, **WORLDS[kind]).unwrapped)
-
-
-@every_world
-def test_specs_round_trip(kind):
-    env = gym.make(ID, **WORLDS[kind])
-    assert_same(of_its_spec(env).reset(seed=3), env.reset(seed=3))
-
-
-@every_world
-def test_world_i_of_a_vector_is_the_scalar_environment_seeded_alike(kind):
-    vector = BaseStationVectorEnv(3, **WORLDS[kind])
-    peer = peer_of(BaseStationEnv, AutoresetMode.NEXT_STEP, 3, WORLDS[kind])
-    steps = assert_steps_alike(vector, peer, 9, 7, {"rtol": 1e-9, "atol": 1e-9})
-    if "scenes" not in WORLDS[kind]:
-        assert [truncated.all() for _, _, _, truncated, _ in steps].count(True) == 1
 
 
 def test_angles_and_score_by_hand():
@@ -101,18 +77,6 @@ def test_a_nearer_station_sees_better():
             info = env.step(np.tile([0.0, direction, 0.0], (20, 1)))[-1]
         scores[direction] = np.log(info["score_m"]).mean()
     assert scores[1.0] < scores[-1.0] - 0.05
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_twins_in_mid_episode_go_on_alike_in_every_mode(mode):
-    env = BaseStationVectorEnv(3, scene={"steps": 4}, autoreset_mode=mode)
-    env.reset(seed=1)
-    env.step(actions_of(env, np.random.default_rng(1)))
-    assert_twins_go_on_alike(env, 3 if mode == "Disabled" else 7)
-
-
-def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared():
-    assert_memory_is_not_shared(lambda: BaseStationVectorEnv(3, scene={"steps": 4}), 7)
 
 
 @pytest.mark.parametrize(

@@ -156,17 +156,20 @@ def test_a_pair_that_comes_twice_is_dropped_and_counted(tmp_path):
     ("change", "message"),
     [
         ({"anchors": None}, "differences need a table of anchors"),
-        ({"format": recordings.Format(offset="anchor")}, "offset must be None or 'tag'"),
+        ({"offset": "anchor"}, "offset must be None or 'tag'"),
         ({"calibration": "c.csv"}, "calibration must be left out for ranges"),
     ],
 )  # fmt: skip
 def test_what_does_not_go_with_differences_is_refused(tmp_path, change, message):
     t, _, _, arrivals, _ = walk(3)
     path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, REFERENCE))
+    change = dict(change)
     if "calibration" in change:
         change = {"calibration": write(tmp_path, "c.csv", "anchor,tag,bias_m", [[0, 0, 0.1]])}
+    format = recordings.Format(offset=change.pop("offset", None))
+    files = recordings.Files(path, **{**tables(tmp_path), **change})
     with pytest.raises(ValueError, match=message):
-        recordings.read_recording(recordings.Files(path, **{**tables(tmp_path), **change}))
+        recordings.read_recording(files, format=format)
 
 
 def test_differences_longer_than_their_anchors_are_apart_are_refused(tmp_path):

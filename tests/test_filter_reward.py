@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym import estimators, placement
 from rbl_gym.envs.placement import AnchorPlacementEnv
@@ -19,15 +15,6 @@ from rbl_gym.placement import Context
 from rbl_gym.wrappers import FilterReward, VectorFilterReward
 from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_vector
 from rbl_gym.wrappers.filter_tracks import Tracks, track_error, tracks
-from tests.helpers import assert_same
-from tests.side_by_side import (
-    assert_masks_alike,
-    assert_memory_is_not_shared,
-    assert_steps_alike,
-    assert_twins_go_on_alike,
-    of_its_spec,
-    peer_of,
-)
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -207,60 +194,6 @@ def test_other_environments_are_refused():
 
 def test_the_bound_is_the_default_and_the_environment_is_the_bare_one():
     assert type(gym.make(ID).env.env) is AnchorPlacementEnv  # pyright: ignore[reportAttributeAccessIssue]
-
-
-@every_world
-@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
-def test_gymnasiums_checker_has_no_complaint(kind):
-    env: Any = gym.make(ID, **arguments_of(kind))
-    # Below what Gymnasium adds by itself: order enforcing and its passive checker.
-    check_env(env.env.env)
-
-
-@every_world
-def test_specs_round_trip_and_seeds_decide(kind):
-    env = gym.make(ID, **arguments_of(kind))
-    first = episode(env, 3)
-    again = episode(of_its_spec(env), 3)
-    # By the length in the spec Gymnasium adds its limit, which speaks when the last anchor does.
-    assert again[-1][3] is True
-    again[-1] = (*again[-1][:3], False, again[-1][4])
-    assert_same(again, first)
-    assert episode(env, 3)[-1][1] == first[-1][1]
-    assert episode(env, 4)[-1][1] != first[-1][1]
-
-
-def test_a_pickled_environment_goes_on_alike():
-    env = anchor_placement(**arguments_of("auv"))
-    env.reset(seed=1)
-    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        assert_same(episode(twin, 2), episode(env, 2))
-    envs = anchor_placement_vector(num_envs=3, **arguments_of("racks"))
-    envs.reset(seed=1)
-    assert_twins_go_on_alike(envs, 8)
-
-
-@every_world
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_equals_scalar_environments(kind, mode):
-    arguments = arguments_of(kind)
-    native = anchor_placement_vector(num_envs=3, autoreset_mode=mode, **arguments)
-    peer = peer_of(anchor_placement, mode, 3, arguments)
-    steps = assert_steps_alike(native, peer, 8, [5, 3, 8], TOLERANCE)
-    assert any(step[1].any() for step in steps)
-
-
-def test_disabled_resets_what_the_mask_says():
-    arguments = arguments_of("racks")
-    mode = AutoresetMode.DISABLED
-    native = anchor_placement_vector(num_envs=3, autoreset_mode=mode, **arguments)
-    peer = peer_of(anchor_placement, mode, 3, arguments)
-    assert_masks_alike(native, peer, 12, ("tag_error_m", "score_m"), TOLERANCE)
-
-
-def test_memory_is_never_shared():
-    world = {**arguments_of("racks"), "autoreset_mode": "SameStep"}
-    assert_memory_is_not_shared(lambda: anchor_placement_vector(num_envs=2, **world), 7)
 
 
 def test_frames_can_be_made():

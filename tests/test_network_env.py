@@ -28,7 +28,6 @@ from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
     assert_memory_is_not_shared,
-    assert_twins_go_on_alike,
     of_its_spec,
 )
 
@@ -72,13 +71,6 @@ def test_specs_round_trip_with_the_wrapper():
     action = np.full(10, 0.3, np.float32)
     assert_same(again.reset(seed=2), env.reset(seed=2))
     assert_same(again.step(action), env.step(action))
-
-
-def test_twins_in_mid_episode_go_on_alike():
-    env = PlanarNetworkVectorEnv(2, n_nodes=6)
-    env.reset(seed=1)
-    env.step(actions_of(env, np.random.default_rng(0)))
-    assert_twins_go_on_alike(env, 3)
 
 
 def test_memory_is_never_shared():

@@ -9,8 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym import placement
 from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
@@ -18,14 +16,6 @@ from rbl_gym.placement import Context
 from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_same
 from tests.side_by_side import (
-    actions_of,
-    assert_masks_alike,
-    assert_memory_is_not_shared,
-    assert_mixes_alike,
-    assert_steps_alike,
-    assert_twins_go_on_alike,
-    of_its_spec,
-    peer_of,
     spoil,
 )
 
@@ -72,38 +62,6 @@ def context_of(info) -> Context:
 
 
 # --- Gymnasium --------------------------------------------------------------------------------
-
-
-# Every mode, with racks and without, with sight and without, few anchors.
-@pytest.mark.parametrize("kind", ["satellite", "one rack, one anchor", "own scene", "at once, auv",
-                                  "sight at once", "mounts and racks"])  # fmt: skip
-def test_gymnasiums_checker_has_no_complaint(kind):
-    check_env(gym.make(ID, **WORLDS[kind]).unwrapped)
-
-
-@every_world
-def test_specs_round_trip(kind):
-    env = gym.make(ID, **WORLDS[kind])
-    again, actions = episode(of_its_spec(env), 3)
-    # By the length in the spec Gymnasium adds its limit, which speaks when the last anchor does.
-    *rest, terminated, truncated, info = again[-1]
-    assert (terminated, truncated) == (True, True)
-    again[-1] = (*rest, True, False, info)
-    assert_same((again, actions), episode(env, 3))
-
-
-@every_world
-def test_twins_in_mid_episode_go_on_alike(kind):
-    env = AnchorPlacementVectorEnv(3, **WORLDS[kind])
-    env.reset(seed=1)
-    env.step(actions_of(env, np.random.default_rng(1)))
-    assert_twins_go_on_alike(env, 8)
-
-
-@every_world
-def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared(kind):
-    world = {**WORLDS[kind], "autoreset_mode": "SameStep"}
-    assert_memory_is_not_shared(lambda: AnchorPlacementVectorEnv(3, **world), 7)
 
 
 @every_world
@@ -263,64 +221,6 @@ def test_a_mount_twice_adds_a_second_anchor_there():
 
 
 # --- vector -----------------------------------------------------------------------------------
-
-
-def vectors(kind, mode, n=4):
-    """The native vector environment, and Gymnasium's own around scalar ones."""
-    native = AnchorPlacementVectorEnv(n, **WORLDS[kind], autoreset_mode=mode)
-    return native, peer_of(AnchorPlacementEnv, mode, n, WORLDS[kind])
-
-
-@every_world
-def test_next_step_equals_scalar_environments(kind):
-    steps = assert_steps_alike(*vectors(kind, AutoresetMode.NEXT_STEP), 16, 5, TOLERANCE)
-    assert sum(terminated.all() for _, _, terminated, _, _ in steps) >= 2
-
-
-@every_world
-def test_same_step_equals_scalar_environments_with_final_observation_and_info(kind):
-    both = vectors(kind, AutoresetMode.SAME_STEP)
-    steps = assert_steps_alike(*both, 12, [3, 1, 4, 1], TOLERANCE)
-    ends = [info for *_, info in steps if "final_obs" in info]
-    assert len(ends) >= 2
-    for info in ends:
-        assert (info["final_info"]["score_m"] > 0).all()
-        assert not info["score_m"].any()
-
-
-@every_world
-def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(kind):
-    both = vectors(kind, AutoresetMode.DISABLED)
-    assert_masks_alike(*both, 14, ("region", "racks", "anchors"), TOLERANCE)
-
-
-@pytest.mark.parametrize("kind", ["auv", "mounts and racks"])
-def test_next_step_with_clocks_that_differ_mixes_resets_and_steps(kind):
-    """Worlds that were reset half way stand at other anchors of the sequence."""
-    steps = assert_mixes_alike(*vectors(kind, AutoresetMode.NEXT_STEP), 12, TOLERANCE)
-    assert [True, False, True, False] in [step[2].tolist() for step in steps]
-
-
-@some_worlds
-def test_make_vec_gives_the_native_environment(kind):
-    env = gym.make_vec(ID, num_envs=3, **WORLDS[kind], autoreset_mode="SameStep")
-    assert isinstance(env.unwrapped, AnchorPlacementVectorEnv)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    assert env.spec is not None
-    again = gym.make_vec(env.spec)
-    np.testing.assert_array_equal(again.reset(seed=2)[0], env.reset(seed=2)[0])
-
-
-def test_a_time_limit_truncates():
-    env = gym.make_vec(ID, num_envs=2, max_episode_steps=2, autoreset_mode="SameStep")
-    env.reset(seed=1)
-    ends = []
-    for _ in range(4):
-        _, reward, terminated, truncated, _ = env.step(np.zeros((2, 3)))
-        ends.append(bool(truncated.all()))
-        assert not terminated.any()
-        assert not reward.any()
-    assert ends == [False, True, False, True]
 
 
 def test_contexts_are_those_in_info():

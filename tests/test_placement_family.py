@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym import placement
@@ -23,11 +22,7 @@ from rbl_gym.wrappers import FilterReward, VectorFilterReward
 from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
-    assert_masks_alike,
-    assert_memory_is_not_shared,
     assert_steps_alike,
-    assert_twins_go_on_alike,
-    of_its_spec,
     peer_of,
 )
 
@@ -71,41 +66,6 @@ def task_told(info) -> placement.PlacementTask:
     told = json.loads(info["scene"])
     n_anchors, racks = told.pop("n_anchors"), told.pop("racks")
     return placement.task(told, n_anchors, racks)
-
-
-@every_world
-def test_gymnasiums_checker_and_specs(kind):
-    env = gym.make(ID, **WORLDS[kind])
-    check_env(env.unwrapped)
-    want = episode(env, 3)
-    # By the length in the spec Gymnasium adds its limit.
-    assert_same([step[:2] for step in episode(of_its_spec(env), 3)], [step[:2] for step in want])
-
-
-@every_world
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_world_i_equals_the_scalar_environment(kind, mode):
-    native = PlacementFamilyVectorEnv(5, autoreset_mode=mode, **WORLDS[kind])
-    peer = peer_of(PlacementFamilyEnv, mode, 5, WORLDS[kind])
-    assert_steps_alike(native, peer, 14, 3, TOLERANCE)
-
-
-@every_world
-def test_worlds_are_reset_by_masks(kind):
-    mode = AutoresetMode.DISABLED
-    native = PlacementFamilyVectorEnv(4, autoreset_mode=mode, **WORLDS[kind])
-    peer = peer_of(PlacementFamilyEnv, mode, 4, WORLDS[kind])
-    assert_masks_alike(native, peer, 10, ("region", "racks", "anchor_mask"), TOLERANCE, ["scene"])
-
-
-@every_world
-def test_twins_and_memory(kind):
-    env = PlacementFamilyVectorEnv(3, **WORLDS[kind])
-    env.reset(seed=1)
-    env.step(actions_of(env, np.random.default_rng(1)))
-    assert_twins_go_on_alike(env, 6)
-    world = {**WORLDS[kind], "autoreset_mode": "SameStep"}
-    assert_memory_is_not_shared(lambda: PlacementFamilyVectorEnv(3, **world), 6)
 
 
 @every_world

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import json
-import pickle
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rbl_gym.wrappers.shared_anchors import SharedAnchorsEnv, SharedAnchorsVectorEnv
-from tests.helpers import assert_same, needs
-from tests.side_by_side import actions_of, assert_steps_alike
+from tests.helpers import needs
+from tests.side_by_side import actions_of
 
 ID = "rbl_gym:RBL/SharedAnchors-v0"
 PLATE = [[0.5, 0.5, 0], [-0.5, 0.5, 0.1], [0.5, -0.5, 0.2], [-0.5, -0.5, 0]]
@@ -26,11 +21,6 @@ TWO: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("observation", ["dict", "flat"])
-def test_check_env(observation):
-    check_env(gym.make(ID, observation=observation, **TWO).unwrapped, skip_render_check=False)
-
-
 @needs("stable_baselines3")
 def test_sb3_checker():
     from stable_baselines3.common.env_checker import (  # pyright: ignore[reportMissingImports]
@@ -38,19 +28,6 @@ def test_sb3_checker():
     )
 
     check_sb3(SharedAnchorsEnv(observation="flat", **TWO))
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize(
-    "arguments",
-    [{"combine": "worst"}, {"filter": "uc-kf", "observation": "flat"}, {"reward": "error"}],
-    ids=str,
-)
-def test_world_i_equals_the_scalar_environment(mode, arguments):
-    arguments = {**TWO, **arguments}
-    native = SharedAnchorsVectorEnv(3, autoreset_mode=mode, **arguments)
-    peer = SyncVectorEnv([lambda: SharedAnchorsEnv(**arguments)] * 3, autoreset_mode=mode)
-    assert_steps_alike(native, peer, 13, 3, {"rtol": 2e-5, "atol": 2e-6})
 
 
 def test_ranges_are_those_of_each_body_to_the_same_anchors():
@@ -99,20 +76,6 @@ def test_one_body_alone_is_a_world_of_its_own():
     assert env.action_space == gym.spaces.Discrete(1)
 
 
-def test_seeds_specifications_and_pickling():
-    env = gym.make(ID, **TWO)
-    assert env.spec is not None
-    others = [gym.make(EnvSpec.from_json(env.spec.to_json())), pickle.loads(pickle.dumps(env))]
-    rng = np.random.default_rng(1)
-    actions = [rng.uniform(-1, 1, 15).astype(np.float32) for _ in range(5)]
-    want = [env.reset(seed=4), *(env.step(action) for action in actions)]
-    assert env.spec.max_episode_steps == 5
-    for other in others:
-        assert_same([other.reset(seed=4), *(other.step(action) for action in actions)], want)
-    again = env.reset()[0]["ranges"]
-    assert not np.array_equal(again, want[0][0]["ranges"])
-
-
 def test_masks_restart_only_some_worlds():
     envs = SharedAnchorsVectorEnv(3, autoreset_mode="Disabled", **TWO)
     envs.reset(seed=1)
@@ -145,16 +108,3 @@ def test_masks_restart_only_some_worlds():
 def test_wrong_arguments_are_named(arguments, named):
     with pytest.raises(ValueError, match=named):
         SharedAnchorsVectorEnv(**{**TWO, **arguments})
-
-
-def test_steps_before_a_reset_and_after_the_end_are_refused():
-    env = SharedAnchorsEnv(**TWO)
-    with pytest.raises(ResetNeeded):
-        env.step(np.zeros(15))
-    env.reset(seed=1)
-    for _ in range(5):
-        env.step(np.zeros(15))
-    with pytest.raises(ResetNeeded):
-        env.step(np.zeros(15))
-    with pytest.raises(ValueError, match="action"):
-        env.step(np.full(15, np.nan))

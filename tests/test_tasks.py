@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bounds, estimators, motion
@@ -22,12 +21,7 @@ from rbl_gym.wrappers.tasks import MobileAnchorsEnv, MobileAnchorsVectorEnv
 from tests.helpers import assert_same, score_by_hand, share_by_hand
 from tests.side_by_side import (
     actions_of,
-    assert_masks_alike,
-    assert_memory_is_not_shared,
-    assert_mixes_alike,
     assert_steps_alike,
-    assert_twins_go_on_alike,
-    of_its_spec,
     peer_of,
 )
 
@@ -69,46 +63,6 @@ def run(env, n, seed=0):
 
 
 @every_world
-def test_gymnasiums_checker_has_no_complaint(kind):
-    env_id, arguments = WORLDS[kind]
-    check_env(gym.make(env_id, **arguments).unwrapped)
-
-
-@every_world
-def test_specs_round_trip(kind):
-    env_id, arguments = WORLDS[kind]
-    env = gym.make(env_id, **arguments)
-    again, action = of_its_spec(env), env.action_space.sample()
-    assert_same(again.reset(seed=2), env.reset(seed=2))
-    assert_same(again.step(action), env.step(action))
-
-
-@every_world
-def test_twins_in_mid_episode_go_on_alike(kind):
-    _, vector, arguments = short(kind)
-    env = vector(3, **arguments)
-    run(env, 2)
-    assert_twins_go_on_alike(env, 8)
-
-
-@every_world
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared(kind, mode):
-    _, vector, arguments = short(kind)
-    assert_memory_is_not_shared(lambda: vector(3, **arguments, autoreset_mode=mode), 11)
-
-
-@every_world
-def test_seeds_decide_and_episodes_differ(kind):
-    scalar, _, arguments = short(kind)
-    env = scalar(**arguments)
-    first, _ = env.reset(seed=4)
-    np.testing.assert_array_equal(env.reset(seed=4)[0], first)
-    assert (env.reset()[0] != first).any()
-    assert (env.reset(seed=5)[0] != first).any()
-
-
-@every_world
 def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
     env_id, arguments = WORLDS[kind]
     steps = 100 if env_id == MOBILE else 50
@@ -129,40 +83,6 @@ def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
         assert truncated is (k == steps)
     with pytest.raises(ResetNeeded):
         env.step(env.action_space.sample())
-
-
-# --- vector against scalar --------------------------------------------------------------------
-
-
-def vectors(kind, mode, n=3):
-    scalar, vector, arguments = short(kind)
-    return vector(n, **arguments, autoreset_mode=mode), peer_of(scalar, mode, n, arguments)
-
-
-@every_world
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_equals_scalar_environments(kind, mode):
-    steps = assert_steps_alike(*vectors(kind, mode), 12, [5, 3, 8], TOLERANCE)
-    assert sum(truncated.all() for _, _, _, truncated, _ in steps) >= 2
-
-
-@every_world
-def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(kind):
-    assert_masks_alike(*vectors(kind, AutoresetMode.DISABLED), 13, ("score_m",), TOLERANCE)
-
-
-@every_world
-def test_next_step_mixes_resets_and_steps(kind):
-    steps = assert_mixes_alike(*vectors(kind, AutoresetMode.NEXT_STEP), 12, TOLERANCE)
-    for step, (_, _, _, truncated, _) in enumerate(steps):
-        assert truncated.any() == (step % 5 in (2, 3))
-
-
-@every_world
-def test_a_shorter_limit_truncates(kind):
-    env_id, arguments = WORLDS[kind]
-    envs = gym.make_vec(env_id, num_envs=2, max_episode_steps=3, **arguments)
-    assert [step[3].all() for step in run(envs, 4)[1:]] == [False, False, True, False]
 
 
 # --- the belief by a separate filter ----------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import multiprocessing
-import pickle
 from collections.abc import Iterator
 from typing import Any
 
@@ -86,35 +85,6 @@ def test_registration_is_idempotent():
     before = registry["RBL/Tracking-v0"]
     rbl_gym._register_environments()
     assert registry["RBL/Tracking-v0"] is before
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_same_seed_and_actions_give_the_same_rollout(name):
-    scene = short(name, links=LOSSY)
-    first, second = TrackingEnv(scene), TrackingEnv(scene)
-    assert_same(list(rollout(first, 3)), list(rollout(second, 3)))
-    assert_same(list(rollout(first, 3)), list(rollout(first, 3)))
-    other = list(rollout(second, 4))
-    assert (other[0][0]["ranges"] != next(rollout(first, 3))[0]["ranges"]).any()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_reset_without_a_seed_continues_the_stream(name):
-    first, second = TrackingEnv(short(name)), TrackingEnv(short(name))
-    observations = [env.reset(seed=1)[0] for env in (first, second)]
-    again = [env.reset()[0] for env in (first, second)]
-    assert_same(again[0], again[1])
-    assert (again[0]["ranges"] != observations[0]["ranges"]).all()
-
-
-@pytest.mark.parametrize("name", ["uwb_room", "satellite"])
-def test_pickled_environment_continues_as_the_original(name):
-    env = TrackingEnv(short(name, links=LOSSY))
-    list(rollout(env, 5, steps=4))
-    twin = pickle.loads(pickle.dumps(env))
-    actions = [env.action_space.sample() for _ in range(8)]
-    assert_same([env.step(action) for action in actions], [twin.step(action) for action in actions])
-    assert_same(env.reset(), twin.reset())  # the generator came along
 
 
 @pytest.mark.parametrize("scene", [*NAMES, OVERRIDDEN], ids=[*NAMES, "overridden"])
@@ -241,16 +211,6 @@ def test_observations_and_infos_share_no_memory(name):
         assert not any(np.shares_memory(array, other) for other in kept[:i])
 
 
-@pytest.mark.parametrize("reward", ["bound", "none"])
-@pytest.mark.parametrize("name", NAMES)
-def test_reward_is_a_float_and_the_flags_are_bools(name, reward):
-    for _, value, terminated, truncated, _ in rollout(TrackingEnv(short(name, 3), reward)):
-        assert type(value) is float
-        assert type(terminated) is bool
-        assert type(truncated) is bool
-        assert not terminated
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_episode_truncates_after_the_scenes_steps_and_then_needs_a_reset(name):
     env = TrackingEnv(name)
@@ -260,12 +220,6 @@ def test_episode_truncates_after_the_scenes_steps_and_then_needs_a_reset(name):
         env.step(env.action_space.sample())
     env.reset()
     env.step(env.action_space.sample())
-
-
-def test_step_before_reset_is_refused():
-    env = TrackingEnv()
-    with pytest.raises(ResetNeeded, match="reset"):
-        env.step(0)
 
 
 def test_info_tells_the_truth_the_epoch_and_at_reset_the_prior():

@@ -11,11 +11,7 @@ from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds.scenes import SCENES
 from tests.side_by_side import (
-    assert_masks_alike,
-    assert_memory_is_not_shared,
-    assert_mixes_alike,
     assert_steps_alike,
-    assert_twins_go_on_alike,
     peer_of,
 )
 
@@ -44,58 +40,12 @@ def test_next_step_equals_scalar_environments_episode_after_episode(name, links)
     assert_steps_alike(*both, 14, 5, TOLERANCE)
 
 
-@pytest.mark.parametrize("name", ["uwb_room", "auv_buoys", "camsap2013"])
-@pytest.mark.parametrize("reward", ["bound", "none"])
-def test_same_step_equals_scalar_environments_with_final_observation_and_info(name, reward):
-    both = vectors(short(name), AutoresetMode.SAME_STEP, reward=reward)
-    steps = assert_steps_alike(*both, 12, [3, 1, 4, 1], TOLERANCE)
-    assert sum("final_obs" in info for *_, info in steps) == 2
-
-
-@pytest.mark.parametrize("name", ["drone_yard", "satellite"])
-def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(name):
-    both = vectors(short(name, 6), AutoresetMode.DISABLED)
-    priors = ("prior_rotation", "prior_translation", "prior_covariance")
-    assert_masks_alike(*both, 16, ("rotation", "epoch", "score_m"), TOLERANCE, priors)
-
-
-@pytest.mark.parametrize("name", ["uwb_room", "auv_buoys"])
-def test_next_step_mixes_resets_and_steps(name):
-    steps = assert_mixes_alike(*vectors(short(name), AutoresetMode.NEXT_STEP), 12, TOLERANCE)
-    assert [True, False, True, False] in [step[3].tolist() for step in steps]
-
-
 def test_disabled_refuses_to_step_past_the_end():
     env = TrackingVectorEnv(2, short("uwb_room", 1), autoreset_mode="Disabled")
     env.reset(seed=1)
     env.step(np.zeros(2, int))
     with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
         env.step(np.zeros(2, int))
-
-
-def test_make_vec_gives_the_native_environment_with_its_arguments():
-    env = gym.make_vec(
-        ID, num_envs=3, scene=short("uwb_room", 50), max_episode_steps=4, autoreset_mode="SameStep"
-    )
-    assert isinstance(env.unwrapped, TrackingVectorEnv)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    env.reset(seed=1)
-    ends = [env.step(np.zeros(3, int))[3].all() for _ in range(8)]
-    assert ends == [False, False, False, True] * 2
-    assert env.spec is not None
-    again = gym.make_vec(env.spec)
-    np.testing.assert_array_equal(again.reset(seed=2)[0]["ranges"], env.reset(seed=2)[0]["ranges"])
-
-
-def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared():
-    assert_memory_is_not_shared(lambda: TrackingVectorEnv(3, short("auv_buoys", 4)), 7)
-
-
-def test_twins_in_mid_episode_go_on_alike():
-    env = TrackingVectorEnv(3, short("satellite", 6))
-    env.reset(seed=4)
-    env.step(np.zeros((3, 15)))
-    assert_twins_go_on_alike(env, 9)
 
 
 @pytest.mark.parametrize(
