@@ -11,7 +11,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from tests.helpers import assert_same
 
@@ -110,6 +111,19 @@ def of_its_spec(env: Any) -> Any:
     assert again.spec is not None
     assert json.loads(again.spec.to_json()) == json.loads(text)
     return again
+
+
+def assert_contract(env_id: str, **arguments: Any) -> None:
+    """Checker, spec, copies, and native vector environments beside scalar ones, in short."""
+    env = gym.make(env_id, **arguments)
+    check_env(env.unwrapped, skip_render_check=True)
+    assert_same(of_its_spec(env).reset(seed=3), env.reset(seed=3))
+    twin, action = pickle.loads(pickle.dumps(env)), env.action_space.sample()
+    assert_same(twin.step(action), env.step(action))
+    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
+        native = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, **arguments)
+        peer = peer_of(lambda: gym.make(env_id, **arguments).unwrapped, mode, 3, {})
+        assert_steps_alike(native, peer, 6, 3, {"rtol": 2e-5, "atol": 2e-5})
 
 
 def assert_twins_go_on_alike(env: Any, steps: int) -> None:

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bounds
 from rbl_gym.bounds import doa
@@ -18,11 +18,7 @@ from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
 from rbl_gym.measurements import bearing
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.side_by_side import (
-    actions_of,
-    assert_steps_alike,
-    of_its_spec,
-)
+from tests.side_by_side import assert_steps_alike, of_its_spec, peer_of
 
 ID = "rbl_gym:RBL/BaseStation-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -129,27 +125,12 @@ def test_the_belief_is_honest_and_the_bound_is_reached():
     assert np.mean(nees) == pytest.approx(6, rel=0.15)
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_filters_of_a_vector_are_those_of_scalar_environments(mode):
-    envs = VectorEstimatePose(BaseStationVectorEnv(2, scene={"steps": 3}, autoreset_mode=mode))
-    scalars = [EstimatePose(BaseStationEnv(scene={"steps": 3})) for _ in range(2)]
-    envs.reset(seed=4)
-    for i, env in enumerate(scalars):
-        env.reset(seed=4 + i)
-    rng = np.random.default_rng(0)
-    for _ in range(7):
-        actions = actions_of(envs, rng)
-        _, reward, _, truncated, info = envs.step(actions)
-        results = [env.step(one) for env, one in zip(scalars, actions, strict=True)]
-        np.testing.assert_allclose(reward, [one[1] for one in results], rtol=1e-9)
-        over = truncated.all()
-        final = info["final_info"] if mode == "SameStep" and over else info
-        np.testing.assert_allclose(final["nees"], [one[4]["nees"] for one in results], rtol=1e-6)
-        if over:
-            for env in scalars:
-                env.reset()
-        if over and mode == "NextStep":
-            envs.step(actions)
+    scene = {"steps": 3}
+    native = VectorEstimatePose(BaseStationVectorEnv(2, scene=scene, autoreset_mode=mode))
+    peer = peer_of(lambda: EstimatePose(BaseStationEnv(scene=scene)), mode, 2, {})
+    assert_steps_alike(native, peer, 7, 4, {"rtol": 1e-6, "atol": 1e-9})
 
 
 def test_filters_of_ranges_are_refused():
@@ -190,10 +171,8 @@ def test_filters_run_in_drawn_worlds(mode, observation):
     native: Any = VectorEstimatePose(
         BaseStationVectorEnv(3, scenes=DRAWN, autoreset_mode=mode), observation=observation
     )
-    peer = SyncVectorEnv(
-        [lambda: EstimatePose(BaseStationEnv(scenes=DRAWN), observation=observation)] * 3,
-        autoreset_mode=mode,
-    )
+    scalar = lambda: EstimatePose(BaseStationEnv(scenes=DRAWN), observation=observation)  # noqa: E731
+    peer = peer_of(scalar, mode, 3, {})
     assert_steps_alike(native, peer, 8, 3, {"rtol": 2e-5, "atol": 2e-5})
 
 

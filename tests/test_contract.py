@@ -23,7 +23,9 @@ from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_ve
 from rbl_gym.wrappers.shared_anchors import SharedAnchorsEnv, SharedAnchorsVectorEnv
 from tests import (
     test_base_station_env,
+    test_families,
     test_filter_reward,
+    test_network_family,
     test_placement_env,
     test_placement_family,
     test_shared_anchors,
@@ -72,21 +74,26 @@ PRIORS = ("prior_rotation", "prior_translation", "prior_covariance")
 LOSSY = {"drop_probability": 0.2, "nlos_probability": 0.1, "reach_m": 500.0}
 PLACEMENT = "rbl_gym:RBL/AnchorPlacement-v0"
 WORLDS: dict[str, World] = {}
-for kind, scene, reward in (
-    ("fixed", {"name": "uwb_room"}, "bound"),
-    ("lossy", {"name": "auv_buoys", "links": LOSSY}, "bound"),
-    ("of the paper", {"name": "camsap2013"}, "none"),
-    ("racks", {"name": "hall"}, "bound"),
-):
+for kind, arguments in {
+    "fixed": {"scene": {"name": "uwb_room", "steps": 5}},
+    "lossy": {"scene": {"name": "auv_buoys", "links": LOSSY, "steps": 5}},
+    "of the paper": {"scene": {"name": "camsap2013", "steps": 5}, "reward": "none"},
+    "racks": {"scene": {"name": "hall", "steps": 5}},
+    "drawn": {"scenes": test_families.MIXED},
+}.items():
     WORLDS[f"tracking, {kind}"] = World(
-        "rbl_gym:RBL/Tracking-v0", TrackingEnv, TrackingVectorEnv,
-        {"scene": {**scene, "steps": 5}, "reward": reward}, known=("rotation", "epoch"),
-        at_reset=PRIORS,
+        "rbl_gym:RBL/Tracking-v0", TrackingEnv, TrackingVectorEnv, arguments,
+        known=("rotation", "epoch"), at_reset=PRIORS,
     )  # fmt: skip
 for kind in test_tasks.WORLDS:
     scalar, vector, arguments = test_tasks.short(kind)
     WORLDS[f"task, {kind}"] = World(
         test_tasks.WORLDS[kind][0], scalar, vector, arguments, 2e-5, 2e-6, ("score_m",)
+    )
+for number, (env_id, arguments) in enumerate(test_families.TASKS, 1):
+    env_id = f"rbl_gym:{env_id}"
+    WORLDS[f"task, drawn, {number}"] = World(
+        env_id, *test_tasks.CLASSES[env_id], arguments, 2e-5, 2e-6, ("score_m",), ("scene",)
     )
 for kind, arguments in test_placement_env.WORLDS.items():
     WORLDS[f"placement, {kind}"] = World(
@@ -110,7 +117,9 @@ for kind, arguments in test_base_station_env.WORLDS.items():
 for kind, arguments in {
     "bearings": {"n_nodes": 6},
     "lengths": {"n_nodes": 5, "lengths": "all", "reward": "none"},
-    "drawn": {"scenes": {"n_nodes": {"integers": [3, 6]}}, "lengths": "one"},
+    "drawn": {"scenes": test_network_family.DRAWN},
+    "drawn, one length": {"scenes": test_network_family.DRAWN, "lengths": "one"},
+    "drawn, all lengths": {"scenes": test_network_family.DRAWN, "lengths": "all"},
 }.items():
     WORLDS[f"network, {kind}"] = World(
         "rbl_gym:RBL/PlanarNetwork-v0", PlanarNetworkEnv, PlanarNetworkVectorEnv,
@@ -126,6 +135,12 @@ for kind, arguments in {
         {**test_shared_anchors.TWO, **arguments}, 2e-5, 2e-6,
     )  # fmt: skip
 every_world = pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
+# Those of which no episode is a single step.
+LONG = {
+    kind: world
+    for kind, world in WORLDS.items()
+    if not any(part in kind for part in ("at once", "one anchor", "placement, drawn"))
+}
 
 
 def episode(env: Any, seed: int, limit: int = 8) -> list[Any]:
@@ -192,7 +207,7 @@ def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared(world):
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_equals_scalar_environments(world, mode):
     """With final observation and info where the reset is in the same step."""
-    steps = assert_steps_alike(*world.vectors(mode), 12, [5, 3, 8], world.tolerance)
+    steps = assert_steps_alike(*world.vectors(mode), 14, [5, 3, 8], world.tolerance)
     ends = [info for *_, terminated, truncated, info in steps if (terminated | truncated).any()]
     assert len(ends) >= 2
     assert all(("final_obs" in info) == (mode is AutoresetMode.SAME_STEP) for info in ends)
@@ -204,7 +219,7 @@ def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(world):
     assert_masks_alike(*both, 12, world.known, world.tolerance, world.at_reset)
 
 
-@every_world
+@pytest.mark.parametrize("world", LONG.values(), ids=LONG)
 def test_next_step_mixes_resets_and_steps(world):
     """Worlds that were reset half way stand at other epochs, or anchors, than the others."""
     assert_mixes_alike(*world.vectors(AutoresetMode.NEXT_STEP), 10, world.tolerance)

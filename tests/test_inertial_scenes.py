@@ -9,14 +9,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym import motion
+from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import inertial
 from rbl_gym.motion import navigation
 from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scenes, simulation
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
+from tests.side_by_side import assert_steps_alike, peer_of
 
 ID = "rbl_gym:RBL/Tracking-v0"
 SCENE = {"name": "uwb_room", "inertial": "consumer", "steps": 6}
@@ -141,32 +144,12 @@ def test_the_readings_of_an_epoch_are_a_copy():
 
 @pytest.mark.parametrize("filter", ["iekf-imu", "iekf"])
 def test_scalar_and_vector_environments_agree(filter):
+    mode = AutoresetMode.NEXT_STEP
     envs = VectorEstimatePose(gym.make_vec(ID, num_envs=3, scene=SCENE), filter)
-    single = [EstimatePose(gym.make(ID, scene=SCENE), filter) for _ in range(3)]
-    observed, info = envs.reset(seed=[5, 6, 7])
-    for i, env in enumerate(single):
-        one, told = env.reset(seed=5 + i)
-        for _ in range(1):
-            for key, value in one.items():
-                np.testing.assert_allclose(observed[key][i], value, rtol=1e-9, atol=1e-9)
-            assert told["score_m"] == pytest.approx(info["score_m"][i])
-    for _ in range(SCENE["steps"]):
-        observed, reward, _, truncated, info = envs.step(np.zeros(3, dtype=int))
-        for i, env in enumerate(single):
-            one, alone, _, over, told = env.step(0)
-            for key, value in one.items():
-                np.testing.assert_allclose(
-                    observed[key][i], value, rtol=1e-6, atol=1e-8, err_msg=key
-                )
-            assert alone == pytest.approx(reward[i])
-            assert over == truncated[i]
-            for key in ("bound_m", "velocity", "inertial_bias", "nees"):
-                np.testing.assert_allclose(info[key][i], told[key], rtol=1e-6, err_msg=key)
-    # The next step resets all of them.
-    observed, *_ = envs.step(np.zeros(3, dtype=int))
-    assert (observed["inertial"] == 0).all()
-    for env in [envs, *single]:
-        env.close()
+    peer = peer_of(lambda: EstimatePose(TrackingEnv(SCENE), filter), mode, 3, {})
+    steps = assert_steps_alike(envs, peer, SCENE["steps"] + 1, 5, {"rtol": 1e-6, "atol": 1e-8})
+    # The last step resets all of them.
+    assert (steps[-1][0]["inertial"] == 0).all()
 
 
 def test_the_inertial_filter_beats_the_told_twist_in_the_environment():

@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
 from rbl_gym.estimators.networks.beliefs import consensus
@@ -28,7 +30,9 @@ from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
     assert_memory_is_not_shared,
+    assert_steps_alike,
     of_its_spec,
+    peer_of,
 )
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
@@ -88,31 +92,14 @@ def test_memory_is_never_shared():
     ids=["raw", "estimated", "in random order"],
 )
 def test_world_i_of_a_vector_is_the_scalar_environment(options, lengths):
-    vector = make_vec(steps=5, lengths=lengths)
-    scalars = [make(steps=5, lengths=lengths) for _ in range(3)]
+    vector: Any = make_vec(steps=5, lengths=lengths)
+    scalar: Any = lambda: make(steps=5, lengths=lengths).unwrapped  # noqa: E731
     if options is not None:
         vector = VectorEstimateNetwork(vector, **options)
-        scalars = [EstimateNetwork(env, **options) for env in scalars]
-    rng = np.random.default_rng(2)
-    observation, info = vector.reset(seed=5)
-    for world, env in enumerate(scalars):
-        first, told = env.reset(seed=5 + world)
-        assert_same({key: value[world] for key, value in observation.items()}, first, atol=1e-12)
-    for _ in range(5):
-        actions = actions_of(vector, rng)
-        observation, reward, _, truncated, info = vector.step(actions)
-        assert vector.observation_space.contains(observation)
-        for world, env in enumerate(scalars):
-            single, one, terminated, over, told = env.step(actions[world])
-            assert_same(
-                {key: value[world] for key, value in observation.items()}, single, atol=1e-12
-            )
-            assert one == pytest.approx(reward[world], abs=1e-12)
-            assert type(one) is float
-            assert (terminated, over) == (False, truncated[world])
-            for key, value in told.items():
-                np.testing.assert_allclose(info[key][world], value, atol=1e-12)
-    assert truncated.all()
+        scalar = lambda: EstimateNetwork(make(steps=5, lengths=lengths).unwrapped, **options)  # noqa: E731
+    peer = peer_of(scalar, AutoresetMode.NEXT_STEP, 3, {})
+    steps = assert_steps_alike(vector, peer, 5, 5, {"rtol": 1e-9, "atol": 1e-12})
+    assert steps[-1][3].all()
 
 
 # --- what it measures -------------------------------------------------------------------------

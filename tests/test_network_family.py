@@ -9,15 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
-from rbl_gym.envs.network import PlanarNetworkEnv, PlanarNetworkVectorEnv
 from rbl_gym.envs.network_plans import PRIOR_STD_RAD, NetworkFamily, NetworkPlan
 from rbl_gym.networks.bounds import linked_covariance, linked_pose_covariance
 from rbl_gym.worlds import laws
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from tests.helpers import assert_same
-from tests.side_by_side import assert_steps_alike, peer_of
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
 DRAWN = [
@@ -100,14 +97,6 @@ def test_drawn_networks_by_hand(lengths):
             assert reward == pytest.approx(-np.log(score), abs=1e-9)
     assert len(counts) > 2
     assert stds == {0.01, 0.05, 0.2}
-
-
-@every_length
-def test_many_worlds_are_each_the_scalar_environment(lengths):
-    arguments = {"scenes": DRAWN, "lengths": lengths, "steps": 3}
-    envs = PlanarNetworkVectorEnv(4, autoreset_mode="SameStep", **arguments)
-    peer = peer_of(PlanarNetworkEnv, AutoresetMode.SAME_STEP, 4, arguments)
-    assert_steps_alike(envs, peer, 7, 5, {"rtol": 1e-9, "atol": 1e-9})
 
 
 def test_the_checker_and_frames():

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import pickle
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.base_station import BaseStationEnv
 from rbl_gym.envs.tracking import TrackingEnv
@@ -20,7 +18,7 @@ from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from rbl_gym.wrappers.observations import OBSERVATIONS, Seen, flat, tokens, viewer_of
 from tests.helpers import assert_same
-from tests.side_by_side import assert_steps_alike, of_its_spec
+from tests.side_by_side import assert_contract, assert_steps_alike, of_its_spec, peer_of
 
 ID = "rbl_gym:RBL/Tracking-v0"
 RACK = {"repeat": {"count": [0, 3], "of": [{"uniform": [-9, 9]}, 0.0, 1.0, 1.0, 1.0, 1.0]}}
@@ -139,10 +137,8 @@ def test_world_i_equals_the_scalar_environment(mode, observation, worlds):
     native: Any = VectorEstimatePose(
         TrackingVectorEnv(4, reward="none", autoreset_mode=mode, **worlds), observation=observation
     )
-    peer = SyncVectorEnv(
-        [lambda: EstimatePose(TrackingEnv(reward="none", **worlds), observation=observation)] * 4,
-        autoreset_mode=mode,
-    )
+    scalar = lambda: EstimatePose(TrackingEnv(reward="none", **worlds), observation=observation)  # noqa: E731
+    peer = peer_of(scalar, mode, 4, {})
     assert_steps_alike(native, peer, 9, 3, {"rtol": 2e-5, "atol": 2e-5})
 
 
@@ -150,30 +146,7 @@ def test_world_i_equals_the_scalar_environment(mode, observation, worlds):
 @pytest.mark.parametrize("observation", ["dict", "tokens", PATH], ids=["dict", "tokens", "own"])
 def test_tasks_show_what_is_asked_for(kind, observation):
     name, arguments = TASKS[kind]
-    env = gym.make(f"rbl_gym:RBL/{name}-v0", observation=observation, **arguments)
-    check_env(env.unwrapped)
-    again = of_its_spec(env)
-    assert_same(again.reset(seed=3), env.reset(seed=3))
-    copy = pickle.loads(pickle.dumps(env))
-    action = env.action_space.sample()
-    assert_same(copy.step(action), env.step(action))
-    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
-        native: Any = gym.make_vec(
-            f"rbl_gym:RBL/{name}-v0", num_envs=3, autoreset_mode=mode, observation=observation,
-            **arguments,
-        )  # fmt: skip
-        peer = SyncVectorEnv(
-            [
-                lambda: (
-                    gym.make(
-                        f"rbl_gym:RBL/{name}-v0", observation=observation, **arguments
-                    ).unwrapped
-                )
-            ]
-            * 3,
-            autoreset_mode=mode,
-        )
-        assert_steps_alike(native, peer, 6, 3, {"rtol": 2e-5, "atol": 2e-5})
+    assert_contract(f"rbl_gym:RBL/{name}-v0", observation=observation, **arguments)
 
 
 def test_the_racks_of_the_selection_stay_hidden_and_its_memory_is_shown():

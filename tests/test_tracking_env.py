@@ -127,26 +127,6 @@ def test_max_episode_steps_of_make_truncates():
     assert [step[3] for step in rollout(env)] == [False] * 7 + [True]
 
 
-def test_sync_vector_environment_equals_its_environments():
-    vector = gym.make_vec(ID, num_envs=3, vectorization_mode="sync", scene=short("auv_buoys", 4))
-    singles = [gym.make(ID, scene=short("auv_buoys", 4)) for _ in range(3)]
-    observations, _ = vector.reset(seed=7)
-    alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
-    assert vector.observation_space.contains(observations)
-    vector.action_space.seed(0)
-    for k in range(4):
-        actions = vector.action_space.sample()
-        observations, rewards, _, truncated, _ = vector.step(actions)
-        for i, env in enumerate(singles):
-            alone[i], reward, _, _, _ = env.step(actions[i])
-            assert rewards[i] == reward
-        assert truncated.tolist() == [k == 3] * 3
-        for key in observations:
-            np.testing.assert_array_equal(observations[key], [one[key] for one in alone])
-    vector.step(actions)  # the step after the end resets
-    assert not vector.step(actions)[3].any()
-
-
 # --- spaces, memory, types, the end -----------------------------------------------------------
 
 

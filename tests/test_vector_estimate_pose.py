@@ -8,23 +8,23 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.side_by_side import actions_of
+from tests.side_by_side import assert_masks_alike, assert_steps_alike, peer_of
 from tests.test_tracking_vector_env import ID, short
 
 LOSSY = {"drop_probability": 0.2}
+# What a filter leaves of rounding.
+TOLERANCE = {"rtol": 2e-5, "atol": 2e-6}
 
 
 def pair(scene, mode, filter="iekf", n=3, **arguments):
     native = TrackingVectorEnv(n, scene, autoreset_mode=mode)
-    peer = SyncVectorEnv(
-        [lambda: EstimatePose(TrackingEnv(scene), filter, **arguments)] * n, autoreset_mode=mode
-    )
+    peer = peer_of(lambda: EstimatePose(TrackingEnv(scene), filter, **arguments), mode, n, {})
     return VectorEstimatePose(native, filter, **arguments), peer
 
 
@@ -41,33 +41,13 @@ def pair(scene, mode, filter="iekf", n=3, **arguments):
     ],
 )
 def test_equals_scalar_wrapped_environments(mode, name, filter, arguments):
-    native, peer = pair(short(name, 4, links=LOSSY), mode, filter, **arguments)
-    rng = np.random.default_rng(1)
-    assert_close(native.reset(seed=3), peer.reset(seed=3))
-    for _ in range(10):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            assert_close(a, b)
-        assert native.observation_space.contains(got[0])
-
-
-def assert_close(got, want):
-    """Equal at the precision that a filter's rounding leaves."""
-    assert_same(got, want, rtol=2e-5, atol=2e-6)
+    both = pair(short(name, 4, links=LOSSY), mode, filter, **arguments)
+    assert_steps_alike(*both, 10, 3, TOLERANCE)
 
 
 def test_disabled_restarts_only_what_the_mask_says():
-    native, peer = pair(short("drone_yard", 5), AutoresetMode.DISABLED)
-    assert_close(native.reset(seed=2), peer.reset(seed=2))
-    zeros = np.zeros(3, int)
-    assert_close(native.step(zeros)[:4], peer.step(zeros)[:4])
-    mask = np.array([False, True, False])
-    got = native.reset(options={"reset_mask": mask})[0]
-    assert_close(got, peer.reset(options={"reset_mask": mask})[0])
-    for _ in range(3):
-        a, b = native.step(zeros), peer.step(zeros)
-        assert_close(a[:4], b[:4])
+    both = pair(short("drone_yard", 5), AutoresetMode.DISABLED)
+    assert_masks_alike(*both, 8, ("score_m",), TOLERANCE)
 
 
 class Watched(VectorWrapper):
