@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -16,8 +15,7 @@ from rbl_gym.measurements import link_bias, ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion import unknown_twist as ut
 from rbl_gym.worlds import scenes
-from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
-from tests.helpers import assert_same, random_world, simulate, with_kernels
+from tests.helpers import random_world, simulate, with_kernels
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
@@ -311,42 +309,6 @@ def test_a_vague_prior_finds_its_pose_beside_one_that_knows():
     error = metrics.pose_error(state.rotation, state.translation, rotation, translation)
     assert np.abs(error[:, :3]).max() < 0.6
     assert (metrics.nees(error, filter.belief(state).covariance) < 30).all()
-
-
-@pytest.mark.parametrize("name", ["iekf-cv", "iekf-bias"])
-def test_wrappers_run_them_one_by_one_and_many_at_once(name):
-    scene = {"name": "drone_yard", "steps": 3, "links": {"drop_probability": 0.2}}
-    one = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene=scene), filter=name)
-    many = VectorEstimatePose(
-        gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=2, scene=scene), filter=name
-    )
-    one.reset(seed=5)
-    many.reset(seed=[4, 5])
-    for _ in range(6):
-        _, _, _, truncated, info = one.step(one.action_space.sample() * 0)
-        _, _, _, _, infos = many.step(many.action_space.sample() * 0)
-        if truncated:
-            break
-        assert_same(infos["position_error_m"][1], info["position_error_m"], rtol=1e-7)
-    assert truncated
-    one.close()
-    many.close()
-
-
-def test_states_are_never_changed():
-    rng = np.random.default_rng(9)
-    anchors, tags, rotation, translation = random_world(rng, 5, 4)
-    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
-    for filter in (
-        iekf_cv(tags, NOISE, PROCESS, gyro_std_rad_s=0.1),
-        iekf_bias(tags, NOISE, PROCESS, bias_time_s=1.0),
-    ):
-        state = filter.initial(rotation, translation, 0.01 * np.eye(6))
-        state = filter.update(state, ranges, anchors)
-        before = [field.copy() for field in state]
-        filter.update(filter.predict(state, np.ones(6), 0.1), ranges, anchors)
-        for now, then in zip(state, before, strict=True):
-            np.testing.assert_array_equal(now, then)
 
 
 def test_what_cannot_be_is_refused():

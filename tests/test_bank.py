@@ -3,9 +3,6 @@
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
-import pickle
-
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -15,7 +12,6 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scenes
-from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05)
@@ -266,38 +262,6 @@ def test_an_epoch_without_links_changes_nothing_but_the_window():
             np.testing.assert_allclose(a, b, atol=1e-9)
     assert after.nis == pytest.approx(7.0)
     assert after.links == pytest.approx(3.5)
-
-
-def test_states_are_pickled_and_never_changed_in_place():
-    anchors, tags, twist, _, epochs = mirror_world(np.random.default_rng(12), 1.0)
-    bank = make(tags)
-    state = bank.initial(np.eye(3), [4.0, 3.0, 0.0], VAGUE)
-    state = bank.update(state, epochs[0], anchors)
-    kept = pickle.loads(pickle.dumps(state))
-    for array in state:
-        array.setflags(write=False)
-    bank.update(bank.predict(state, twist, 0.1), epochs[1], anchors)
-    for a, b in zip(state, kept, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def test_environments_take_it_by_its_name():
-    options = {"robust": True}
-    envs = gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=3, scene="uwb_room",
-                        vectorization_mode="vector_entry_point")  # fmt: skip
-    envs = VectorEstimatePose(envs, filter="iekf-bank", options=options)
-    env = EstimatePose(
-        gym.make("rbl_gym:RBL/Tracking-v0", scene="uwb_room"), filter="iekf-bank", options=options
-    )
-    envs.reset(seed=[4, 5, 6])
-    env.reset(seed=5)
-    for _ in range(5):
-        _, reward, _, _, info = envs.step(np.zeros(3, dtype=np.int64))
-        _, alone, _, _, one = env.step(0)
-        assert reward[1] == pytest.approx(alone, abs=1e-9)
-        assert info["nees"][1] == pytest.approx(one["nees"], rel=1e-6)
-    envs.close()
-    env.close()
 
 
 @pytest.mark.parametrize(

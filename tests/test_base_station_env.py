@@ -33,7 +33,6 @@ DRAWN: list[Any] = [
 ]
 WORLDS["drawn"] = {"scenes": DRAWN}
 WORLDS["drawn, coarse"] = {"scenes": DRAWN, "angle_std_rad": 0.05, "reward": "none"}
-every_world = pytest.mark.parametrize("kind", WORLDS)
 
 
 def test_angles_and_score_by_hand():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import pickle
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.envs.placement_family import PlacementFamilyEnv, PlacementFamilyVectorEnv
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose, VectorSelectAnchors
 from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_vector
 from rbl_gym.wrappers.shared_anchors import SharedAnchorsEnv, SharedAnchorsVectorEnv
 from tests import (
@@ -28,6 +30,7 @@ from tests import (
     test_network_family,
     test_placement_env,
     test_placement_family,
+    test_select_anchors,
     test_shared_anchors,
     test_tasks,
 )
@@ -58,6 +61,17 @@ class World(NamedTuple):
     atol: float = 1e-9
     known: tuple[str, ...] = ()
     at_reset: tuple[str, ...] = ()
+    wrap: tuple[Any, Any] = (None, None)
+
+    def make(self) -> Any:
+        """The scalar environment by its id, in its wrapper."""
+        env = gym.make(self.env_id, **self.arguments)
+        return env if self.wrap[0] is None else self.wrap[0](env)
+
+    def alone(self) -> Any:
+        """The scalar environment itself, in its wrapper."""
+        env = self.scalar(**self.arguments)
+        return env if self.wrap[0] is None else self.wrap[0](env)
 
     @property
     def tolerance(self) -> dict[str, float]:
@@ -67,7 +81,8 @@ class World(NamedTuple):
     def vectors(self, mode: AutoresetMode, n: int = 3) -> tuple[Any, Any]:
         """The native vector environment, and Gymnasium's own around scalar ones."""
         native = self.vector(num_envs=n, autoreset_mode=mode, **self.arguments)
-        return native, peer_of(self.scalar, mode, n, self.arguments)
+        native = native if self.wrap[1] is None else self.wrap[1](native)
+        return native, peer_of(self.alone, mode, n, {})
 
 
 PRIORS = ("prior_rotation", "prior_translation", "prior_covariance")
@@ -80,6 +95,8 @@ for kind, arguments in {
     "of the paper": {"scene": {"name": "camsap2013", "steps": 5}, "reward": "none"},
     "racks": {"scene": {"name": "hall", "steps": 5}},
     "drawn": {"scenes": test_families.MIXED},
+    "inertial": {"scene": {"name": "uwb_room", "inertial": "consumer", "steps": 5}},
+    "offsets": {"scene": {"name": "uwb_room", "links": {"offset": "tag"}, "steps": 5}},
 }.items():
     WORLDS[f"tracking, {kind}"] = World(
         "rbl_gym:RBL/Tracking-v0", TrackingEnv, TrackingVectorEnv, arguments,
@@ -134,6 +151,43 @@ for kind, arguments in {
         "rbl_gym:RBL/SharedAnchors-v0", SharedAnchorsEnv, SharedAnchorsVectorEnv,
         {**test_shared_anchors.TWO, **arguments}, 2e-5, 2e-6,
     )  # fmt: skip
+RAW = dict(WORLDS)
+
+
+def wrapped(scene: Any, scalar: Any, vector: Any) -> World:
+    """`RBL/Tracking-v0` in a wrapper and its vector twin."""
+    arguments = {"scene": {**scene, "steps": 4}, "reward": "none"}
+    return World(
+        "rbl_gym:RBL/Tracking-v0", TrackingEnv, TrackingVectorEnv, arguments, 2e-5, 2e-6,
+        ("score_m",), wrap=(scalar, vector),
+    )  # fmt: skip
+
+
+def estimated(scene: Any, filter: str, **options: Any) -> World:
+    """`EstimatePose` and its vector twin."""
+    wrappers = EstimatePose, VectorEstimatePose
+    return wrapped(scene, *(functools.partial(w, filter=filter, **options) for w in wrappers))
+
+
+for scene, filter, options in (
+    ({"name": "auv_buoys", "links": LOSSY}, "iekf", {}),
+    ({"name": "drone_yard", "links": LOSSY}, "uc-kf", {"reward": "error"}),
+    ({"name": "uwb_room"}, "kf-ortho", {"observation": "flat"}),
+    ({"name": "camsap2013"}, "et-kf", {"options": {"threshold": 0.2}}),
+    ({"name": "satellite"}, "iekf/robust=true", {"observation": "flat"}),
+    ({"name": "hall"}, "iekf", {"observation": "tokens"}),
+    ({"name": "drone_yard"}, "iekf-bank/robust=true", {}),
+    ({"name": "drone_yard", "links": LOSSY}, "iekf-cv", {}),
+    ({"name": "drone_yard"}, "iekf-bias", {}),
+    ({"name": "uwb_room", "inertial": "consumer"}, "iekf-imu", {}),
+):
+    WORLDS[f"estimated, {scene['name']}, {filter}"] = estimated(scene, filter, **options)
+for kind, scene in (("hall", test_select_anchors.HALL), ("movable", test_select_anchors.MOVABLE)):
+    WORLDS[f"selected, {kind}"] = wrapped(
+        scene,
+        lambda env: EstimatePose(SelectAnchors(env)),
+        lambda envs: VectorEstimatePose(VectorSelectAnchors(envs)),
+    )
 every_world = pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
 # Those of which no episode is a single step.
 LONG = {
@@ -157,14 +211,14 @@ def episode(env: Any, seed: int, limit: int = 8) -> list[Any]:
 @every_world
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
 def test_gymnasiums_checker_has_no_complaint(world):
-    env: Any = gym.make(world.env_id, **world.arguments)
+    env = world.make()
     # Below what Gymnasium adds by itself: order enforcing and its passive checker.
-    check_env(env.env.env, skip_render_check=True)
+    check_env(env.env.env if world.wrap[0] is None else env, skip_render_check=True)
 
 
 @every_world
 def test_specs_copies_and_seeds_give_the_same_episode(world):
-    env = gym.make(world.env_id, **world.arguments)
+    env = world.make()
     want = episode(env, 3)
     # By the length in the spec Gymnasium adds its limit, which speaks at the end.
     again = episode(of_its_spec(env), 3)
@@ -178,7 +232,7 @@ def test_specs_copies_and_seeds_give_the_same_episode(world):
 
 @every_world
 def test_a_step_needs_a_reset_before_the_first_and_after_the_last(world):
-    env = world.scalar(**world.arguments)
+    env = world.alone()
     with pytest.raises(ResetNeeded):
         env.step(env.action_space.sample())
     *_, (_, _, terminated, truncated, _) = episode(env, 1, 20)
@@ -225,7 +279,7 @@ def test_next_step_mixes_resets_and_steps(world):
     assert_mixes_alike(*world.vectors(AutoresetMode.NEXT_STEP), 10, world.tolerance)
 
 
-@every_world
+@pytest.mark.parametrize("world", RAW.values(), ids=RAW)
 def test_make_vec_gives_the_native_environment_and_a_limit_truncates_it(world):
     env = gym.make_vec(
         world.env_id, num_envs=2, max_episode_steps=2, autoreset_mode="SameStep", **world.arguments

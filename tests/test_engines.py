@@ -15,7 +15,7 @@ from rbl_gym.estimators.linear.kalman import KalmanState
 from rbl_gym.estimators.linear.squared_range import information
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
+from rbl_gym.wrappers import EstimatePose
 from tests.helpers import simulate
 
 FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]
@@ -193,22 +193,6 @@ def test_estimate_pose_runs_filterpy_and_equals_the_batched_engine(scene, name, 
     assert len(used) == 16
     assert_equal(by_default, batched)
     assert "filterpy" in sys.modules
-
-
-@pytest.mark.parametrize("name", FAMILY)
-def test_the_scalar_and_the_vector_form_are_equal_step_by_step(name):
-    scene = {"name": "uwb_room", "steps": 12}
-    envs = VectorEstimatePose(
-        gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=3, scene=scene, reward="none"), name
-    )
-    env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene=scene, reward="none"), name)
-    many, _ = envs.reset(seed=7)
-    one, _ = env.reset(seed=8)
-    for _ in range(12):
-        for key in ("belief_rotation", "belief_translation", "belief_covariance"):
-            np.testing.assert_allclose(many[key][1], one[key], rtol=1e-9, atol=1e-9)
-        many, *_ = envs.step(np.zeros(3, dtype=np.int64))
-        one, *_ = env.step(0)
 
 
 @pytest.mark.parametrize("weights", [None, np.linspace(1, 2, 7)], ids=["measured", "fixed"])

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import pickle
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics, TimeLimit
 from scipy.spatial.transform import Rotation
 
@@ -224,27 +221,6 @@ def test_iekf_believes_itself_at_the_bound():
 
 # --- specs, pickles, memory -------------------------------------------------------------------
 
-ARGUMENTS = [
-    {"filter": "uc-kf"},
-    {"filter": "iekf", "options": {"robust": True}, "reward": "error"},
-    {"filter": "et-kf", "options": {"threshold": 0.2}, "observation": "flat"},
-]
-
-
-@pytest.mark.parametrize("arguments", ARGUMENTS, ids=str)
-def test_spec_makes_the_same_environment_also_through_json(arguments):
-    env = EstimatePose(raw(short("satellite", links=LOSSY)), **arguments)
-    assert env.spec is not None
-    text = env.spec.to_json()
-    assert json.loads(text)["additional_wrappers"][-1]["name"] == "EstimatePose"
-    want = rollout(env, 4)
-    for spec in (env.spec, EnvSpec.from_json(text)):
-        twin = gym.make(spec)
-        assert twin.spec == env.spec
-        assert twin.spec is not None
-        assert twin.spec.to_json() == text
-        assert_same(rollout(twin, 4), want)
-
 
 def test_spec_keeps_the_options_as_they_were():
     options = {"robust": True}
@@ -254,37 +230,6 @@ def test_spec_keeps_the_options_as_they_were():
     kwargs = env.spec.additional_wrappers[-1].kwargs
     assert kwargs is not None
     assert kwargs["options"] == {"robust": True}
-
-
-@pytest.mark.parametrize("filter", ["iekf", "uc-kf"])
-def test_pickled_wrapper_continues_as_the_original(filter):
-    env = wrapped(short("satellite", links=LOSSY), filter)
-    rollout(env, 5, steps=4)
-    twin = pickle.loads(pickle.dumps(env))
-    actions = [env.action_space.sample() for _ in range(5)]
-    assert_same([env.step(a) for a in actions], [twin.step(a) for a in actions])
-    assert_same(env.reset(), twin.reset())
-
-
-@pytest.mark.parametrize("filter", ["iekf", *KALMAN])
-@pytest.mark.parametrize("observation", ["dict", "flat"])
-def test_what_the_user_writes_into_observations_changes_nothing(filter, observation):
-    clean, spoilt = (wrapped(short("satellite"), filter, observation=observation) for _ in range(2))
-    assert_same(spoilt.reset(seed=6), clean.reset(seed=6))
-    for k in range(6):
-        action = np.full(15, 0.1 * k, np.float32)
-        got, want = spoilt.step(action), clean.step(action)
-        assert_same(got, want)
-        arrays = [got[0]] if observation == "flat" else list(got[0].values())
-        for array in (*arrays, *got[4].values()):
-            if isinstance(array, np.ndarray):
-                array.fill(0)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_same_seed_and_actions_give_the_same_rollout(name):
-    scene = short(name, links=LOSSY)
-    assert_same(rollout(wrapped(scene), 7), rollout(wrapped(scene), 7))
 
 
 # --- observations -----------------------------------------------------------------------------
@@ -407,31 +352,3 @@ def test_episode_statistics_sum_its_reward():
     told = results[-1][-1]["episode"]
     assert told["l"] == 12
     assert told["r"] == pytest.approx(-sum(r[-1]["tag_error_m"] for r in results[1:]), rel=1e-5)
-
-
-@pytest.mark.parametrize("observation", ["dict", "flat"])
-def test_sync_vector_of_wrapped_environments_equals_them_one_by_one(observation):
-    def wrap(env: gym.Env) -> gym.Wrapper:
-        return EstimatePose(env, "iekf", observation=observation)
-
-    scene = short("satellite", 5)
-    vector = gym.make_vec(ID, num_envs=3, vectorization_mode="sync", wrappers=[wrap], scene=scene)
-    singles = [wrapped(scene, observation=observation) for _ in range(3)]
-    vector.action_space.seed(0)
-    seen, _ = vector.reset(seed=13)
-    alone = [env.reset(seed=13 + i)[0] for i, env in enumerate(singles)]
-    for k in range(5):
-        actions = vector.action_space.sample()
-        seen, rewards, _, truncated, info = vector.step(actions)
-        for i, env in enumerate(singles):
-            alone[i], reward, _, _, told = env.step(actions[i])
-            assert rewards[i] == reward
-            assert info["nees"][i] == told["nees"]
-        assert truncated.tolist() == [k == 4] * 3
-        if observation == "flat":
-            np.testing.assert_array_equal(seen, np.stack(alone))
-        else:
-            for key in BELIEF:
-                np.testing.assert_array_equal(seen[key], [one[key] for one in alone])
-    assert vector.observation_space.contains(seen)
-    assert np.isfinite(vector.step(actions)[1]).all()  # the reset after the end

@@ -24,8 +24,6 @@ WORLDS: dict[str, dict[str, Any]] = {
     "mounts": {"scene": "uwb_room", "mode": "mounts", "n_anchors": 4, "racks": 1},
     "obstacles": {"scene": {"name": "hall", "n_anchors": 5}, "filter": "iekf-cv"},
 }
-every_world = pytest.mark.parametrize("kind", WORLDS)
-TOLERANCE = {"rtol": 1e-7, "atol": 1e-9}
 
 
 def arguments_of(kind: str) -> dict[str, Any]:

@@ -8,18 +8,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym import motion
-from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import inertial
 from rbl_gym.motion import navigation
 from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scenes, simulation
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
-from tests.side_by_side import assert_steps_alike, peer_of
 
 ID = "rbl_gym:RBL/Tracking-v0"
 SCENE = {"name": "uwb_room", "inertial": "consumer", "steps": 6}
@@ -115,23 +111,6 @@ def test_dicts_of_json_make_the_scene():
 # --- environments ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("reward", ["bound", "none"])
-def test_the_environment_passes_its_checker(reward):
-    env = gym.make(ID, scene=SCENE, reward=reward)
-    check_env(env.unwrapped)
-    observation, info = env.reset(seed=0)
-    assert observation["inertial"].shape == (10, 6)
-    for _ in range(3):
-        observation, *_, info = env.step(0)
-        assert env.observation_space.contains(observation)
-    # A body in the room feels gravity above all.
-    force = np.linalg.norm(observation["inertial"][:, 3:], axis=-1)
-    np.testing.assert_allclose(force, inertial.GRAVITY_M_S2, atol=4)
-    assert info["velocity"].shape == (3,)
-    assert info["inertial_bias"].shape == (6,)
-    env.close()
-
-
 def test_the_readings_of_an_epoch_are_a_copy():
     env: Any = gym.make(ID, scene=SCENE)
     env.reset(seed=0)
@@ -140,16 +119,6 @@ def test_the_readings_of_an_epoch_are_a_copy():
     observation["inertial"][:] = 0
     assert env.unwrapped._episode.readings[1].tobytes() == kept.tobytes()
     env.close()
-
-
-@pytest.mark.parametrize("filter", ["iekf-imu", "iekf"])
-def test_scalar_and_vector_environments_agree(filter):
-    mode = AutoresetMode.NEXT_STEP
-    envs = VectorEstimatePose(gym.make_vec(ID, num_envs=3, scene=SCENE), filter)
-    peer = peer_of(lambda: EstimatePose(TrackingEnv(SCENE), filter), mode, 3, {})
-    steps = assert_steps_alike(envs, peer, SCENE["steps"] + 1, 5, {"rtol": 1e-6, "atol": 1e-8})
-    # The last step resets all of them.
-    assert (steps[-1][0]["inertial"] == 0).all()
 
 
 def test_the_inertial_filter_beats_the_told_twist_in_the_environment():

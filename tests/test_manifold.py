@@ -106,24 +106,6 @@ def test_gradient_and_hessian_by_finite_differences(threshold, tag_variance):
             np.testing.assert_allclose(hessian[axis], numeric, atol=1e-4 * np.abs(hessian).max())
 
 
-def test_a_batch_is_a_loop_over_trials():
-    rng = np.random.default_rng(2)
-    tags = bodies.octahedron()
-    anchors, _, rotation, translation = random_world(rng, 5, 6, (6,))
-    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
-    links = rng.random((6, 5, 6)) > 0.2
-    # Two trials with a vague prior among four with a good one.
-    covariance = np.where(np.arange(6)[:, None, None] < 2, 10.0, 0.01) * np.eye(6)
-    filter = make(tags, robust=True)
-    state = filter.initial(rotation, translation, covariance)
-    whole = filter.belief(filter.update(state, ranges, anchors, links))
-    for k in range(6):
-        state = filter.initial(rotation[k], translation[k], covariance[k])
-        single = filter.belief(filter.update(state, ranges[k], anchors[k], links[k]))
-        for a, b in zip(whole, single, strict=True):
-            np.testing.assert_allclose(a[k], b, atol=1e-8)
-
-
 def test_vague_priors_reach_the_global_optimum_of_brute_force():
     """100 poses against a multi-start from 100 random rotations: not one is missed."""
     rng = np.random.default_rng(3)

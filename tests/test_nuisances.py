@@ -67,11 +67,6 @@ def weights_of(places, noise=NOISE):
     return 1 / noise.variance(d)
 
 
-def first_block(joint, size=6):
-    """Inverse of the pose's block of the inverse of a joint information."""
-    return np.linalg.inv(np.linalg.inv(joint)[:size, :size])
-
-
 @pytest.mark.parametrize("groups", GROUPS)
 def test_joint_information_by_finite_differences(groups):
     places = world(1)

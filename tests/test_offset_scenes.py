@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bounds, ranging
 from rbl_gym.envs.tracking import TrackingEnv
-from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.measurements import offsets
 from rbl_gym.placement import PlacementTask
 from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scenes, simulation
 from rbl_gym.wrappers import EstimatePose
-from tests.side_by_side import assert_steps_alike, peer_of
 
 every_offset = pytest.mark.parametrize("offset", offsets.OFFSETS)
 
@@ -36,15 +31,6 @@ def test_a_scene_checks_and_its_ranges_have_any_sign(offset):
     assert lost.any()
     assert (seen["ranges"][lost] == 0).all()
     assert any((env.step(0)[0]["ranges"] < 0).any() for _ in range(8))
-
-
-@every_offset
-def test_many_worlds_are_single_ones(offset):
-    arguments: dict[str, Any] = {"scene": spec(offset, drop_probability=0.2)}
-    mode = AutoresetMode.NEXT_STEP
-    native = TrackingVectorEnv(3, **arguments, autoreset_mode=mode)
-    tolerance = {"rtol": 1e-9, "atol": 1e-9}
-    assert_steps_alike(native, peer_of(TrackingEnv, mode, 3, arguments), 11, 5, tolerance)
 
 
 @every_offset

@@ -35,9 +35,6 @@ WORLDS: dict[str, dict[str, Any]] = {
     "mounts and racks": {"scene": "uwb_room", "mode": "mounts", "racks": 2},
 }
 every_world = pytest.mark.parametrize("kind", WORLDS)
-# Batched arithmetic may turn the last bits.
-TOLERANCE = {"rtol": 1e-9, "atol": 1e-9}
-some_worlds = pytest.mark.parametrize("kind", ["auv", "at once", "mounts and racks"])
 
 
 def batch_of(env: Any) -> Any:

@@ -49,7 +49,6 @@ WORLDS: dict[str, dict[str, Any]] = {
     "names": {"scenes": ["drone_yard", "auv_buoys"], "n_anchors": 3},
 }
 every_world = pytest.mark.parametrize("kind", WORLDS)
-TOLERANCE = {"rtol": 1e-9, "atol": 1e-9}
 
 
 def episode(env, seed):

@@ -5,17 +5,12 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.tracking import TrackingEnv
-from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose, VectorSelectAnchors
-from tests.helpers import assert_same
-from tests.side_by_side import assert_masks_alike, assert_steps_alike, of_its_spec, peer_of
+from rbl_gym.wrappers import SelectAnchors
 
 HALL = {"name": "hall", "steps": 4, "links": {"drop_probability": 0.2}}
 MOVABLE = {"name": "auv_buoys", "steps": 4}
-TOLERANCE = {"rtol": 1e-9, "atol": 1e-12}
 
 
 @pytest.mark.parametrize("scene", [HALL, MOVABLE])
@@ -41,34 +36,6 @@ def test_an_observation_has_the_links_of_the_chosen_anchors_and_no_others(scene)
         assert not got["links"][~on].any()
         assert not got["ranges"][~on].any()
         assert (got.get("quality", np.ones(len(on)))[~on] == 1).all()
-
-
-def stacked(scene=HALL):
-    return EstimatePose(SelectAnchors(TrackingEnv(scene, "none")), "iekf")
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("scene", [HALL, MOVABLE])
-def test_the_vector_twin_equals_scalar_stacks(mode, scene):
-    envs = VectorSelectAnchors(TrackingVectorEnv(3, scene, "none", autoreset_mode=mode))
-    peer = peer_of(stacked, mode, 3, {"scene": scene})
-    assert_steps_alike(VectorEstimatePose(envs, "iekf"), peer, 11, [5, 3, 8], TOLERANCE)
-
-
-def test_worlds_reset_by_masks_have_chosen_nothing_and_the_others_keep_their_choice():
-    mode = AutoresetMode.DISABLED
-    envs = VectorSelectAnchors(TrackingVectorEnv(3, HALL, "none", autoreset_mode=mode))
-    peer = peer_of(stacked, mode, 3, {})
-    known = "chosen", "score_m"
-    assert_masks_alike(VectorEstimatePose(envs, "iekf"), peer, 11, known, TOLERANCE)
-
-
-def test_specs_round_trip():
-    env = gym.make("rbl_gym:RBL/Tracking-v0", scene=HALL, reward="none")
-    env = EstimatePose(SelectAnchors(env), "iekf")
-    again = of_its_spec(env)
-    assert_same(again.reset(seed=2), env.reset(seed=2))
-    assert_same(again.step(np.ones(12, np.int8)), env.step(np.ones(12, np.int8)))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""VectorEstimatePose against scalar wrapped environments, step by step, in every mode."""
+"""VectorEstimatePose around native vector environments; beside scalar ones: `test_contract`."""
 
 from __future__ import annotations
 
@@ -10,44 +10,10 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
-from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
+from rbl_gym.wrappers import VectorEstimatePose
 from tests.helpers import assert_same
-from tests.side_by_side import assert_masks_alike, assert_steps_alike, peer_of
 from tests.test_tracking_vector_env import ID, short
-
-LOSSY = {"drop_probability": 0.2}
-# What a filter leaves of rounding.
-TOLERANCE = {"rtol": 2e-5, "atol": 2e-6}
-
-
-def pair(scene, mode, filter="iekf", n=3, **arguments):
-    native = TrackingVectorEnv(n, scene, autoreset_mode=mode)
-    peer = peer_of(lambda: EstimatePose(TrackingEnv(scene), filter, **arguments), mode, n, {})
-    return VectorEstimatePose(native, filter, **arguments), peer
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize(
-    ("name", "filter", "arguments"),
-    [
-        ("auv_buoys", "iekf", {}),
-        ("drone_yard", "uc-kf", {"reward": "error"}),
-        ("uwb_room", "kf-ortho", {"observation": "flat"}),
-        ("camsap2013", "et-kf", {}),
-        ("satellite", "iekf", {"options": {"robust": True}, "observation": "flat"}),
-        ("hall", "iekf", {}),
-    ],
-)
-def test_equals_scalar_wrapped_environments(mode, name, filter, arguments):
-    both = pair(short(name, 4, links=LOSSY), mode, filter, **arguments)
-    assert_steps_alike(*both, 10, 3, TOLERANCE)
-
-
-def test_disabled_restarts_only_what_the_mask_says():
-    both = pair(short("drone_yard", 5), AutoresetMode.DISABLED)
-    assert_masks_alike(*both, 8, ("score_m",), TOLERANCE)
 
 
 class Watched(VectorWrapper):
