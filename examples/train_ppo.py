@@ -1,6 +1,6 @@
 """PPO of stable-baselines3 learns where four buoys go, and meets the usual layouts.
 
-    python examples/train_ppo.py          (pip install 'rbl-gym[rl,placement]')
+    python examples/train_ppo.py          (pip install 'rbl-gym[rl]')
 
 `rbl-gym train auv_buoys` does the same for longer; this is what it comes down to. Measured: 0.124 m
 after 100,000 steps, where random layouts have 0.42 m and CMA-ES for each problem 0.105 m; 42 s of
