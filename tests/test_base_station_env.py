@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bounds
 from rbl_gym.bounds import doa
@@ -18,7 +17,7 @@ from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
 from rbl_gym.measurements import bearing
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.side_by_side import assert_steps_alike, of_its_spec, peer_of
+from tests.side_by_side import of_its_spec
 
 ID = "rbl_gym:RBL/BaseStation-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -124,14 +123,6 @@ def test_the_belief_is_honest_and_the_bound_is_reached():
     assert np.mean(nees) == pytest.approx(6, rel=0.15)
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_filters_of_a_vector_are_those_of_scalar_environments(mode):
-    scene = {"steps": 3}
-    native = VectorEstimatePose(BaseStationVectorEnv(2, scene=scene, autoreset_mode=mode))
-    peer = peer_of(lambda: EstimatePose(BaseStationEnv(scene=scene)), mode, 2, {})
-    assert_steps_alike(native, peer, 7, 4, {"rtol": 1e-6, "atol": 1e-9})
-
-
 def test_filters_of_ranges_are_refused():
     with pytest.raises(ValueError, match="filter 'kf' has no option 'measurement'"):
         EstimatePose(gym.make(ID), "kf")
@@ -162,17 +153,6 @@ def test_a_drawn_episode_equals_that_of_its_scene_alone():
             assert reward == pytest.approx(expected, rel=1e-12)
             assert over == ended == (step == told["steps"] - 1)
     assert len(seen) >= 3
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("observation", ["dict", "flat", "tokens"])
-def test_filters_run_in_drawn_worlds(mode, observation):
-    native: Any = VectorEstimatePose(
-        BaseStationVectorEnv(3, scenes=DRAWN, autoreset_mode=mode), observation=observation
-    )
-    scalar = lambda: EstimatePose(BaseStationEnv(scenes=DRAWN), observation=observation)  # noqa: E731
-    peer = peer_of(scalar, mode, 3, {})
-    assert_steps_alike(native, peer, 8, 3, {"rtol": 2e-5, "atol": 2e-5})
 
 
 @pytest.mark.parametrize(

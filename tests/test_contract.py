@@ -20,7 +20,14 @@ from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.envs.placement_family import PlacementFamilyEnv, PlacementFamilyVectorEnv
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose, VectorSelectAnchors
+from rbl_gym.wrappers import (
+    EstimateNetwork,
+    EstimatePose,
+    SelectAnchors,
+    VectorEstimateNetwork,
+    VectorEstimatePose,
+    VectorSelectAnchors,
+)
 from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_vector
 from rbl_gym.wrappers.shared_anchors import SharedAnchorsEnv, SharedAnchorsVectorEnv
 from tests import (
@@ -154,37 +161,61 @@ for kind, arguments in {
 RAW = dict(WORLDS)
 
 
-def wrapped(scene: Any, scalar: Any, vector: Any) -> World:
-    """`RBL/Tracking-v0` in a wrapper and its vector twin."""
-    arguments = {"scene": {**scene, "steps": 4}, "reward": "none"}
-    return World(
-        "rbl_gym:RBL/Tracking-v0", TrackingEnv, TrackingVectorEnv, arguments, 2e-5, 2e-6,
-        ("score_m",), wrap=(scalar, vector),
-    )  # fmt: skip
+def wrapped(world: World, scalar: Any, vector: Any) -> World:
+    """An environment in a wrapper that runs a filter, and in its vector twin."""
+    return world._replace(rtol=2e-5, atol=2e-6, known=(), wrap=(scalar, vector))
 
 
-def estimated(scene: Any, filter: str, **options: Any) -> World:
+def estimated(world: World, **options: Any) -> World:
     """`EstimatePose` and its vector twin."""
     wrappers = EstimatePose, VectorEstimatePose
-    return wrapped(scene, *(functools.partial(w, filter=filter, **options) for w in wrappers))
+    return wrapped(world, *(functools.partial(wrapper, **options) for wrapper in wrappers))
 
 
-for scene, filter, options in (
-    ({"name": "auv_buoys", "links": LOSSY}, "iekf", {}),
-    ({"name": "drone_yard", "links": LOSSY}, "uc-kf", {"reward": "error"}),
-    ({"name": "uwb_room"}, "kf-ortho", {"observation": "flat"}),
-    ({"name": "camsap2013"}, "et-kf", {"options": {"threshold": 0.2}}),
-    ({"name": "satellite"}, "iekf/robust=true", {"observation": "flat"}),
-    ({"name": "hall"}, "iekf", {"observation": "tokens"}),
-    ({"name": "drone_yard"}, "iekf-bank/robust=true", {}),
-    ({"name": "drone_yard", "links": LOSSY}, "iekf-cv", {}),
-    ({"name": "drone_yard"}, "iekf-bias", {}),
-    ({"name": "uwb_room", "inertial": "consumer"}, "iekf-imu", {}),
+def tracking(**arguments: Any) -> World:
+    """`RBL/Tracking-v0` without a bound."""
+    arguments = {"reward": "none", **arguments}
+    return World("rbl_gym:RBL/Tracking-v0", TrackingEnv, TrackingVectorEnv, arguments)
+
+
+for name, fields, options in (
+    ("auv_buoys", {"links": LOSSY}, {}),
+    ("auv_buoys", {}, {"reward": {"kind": "requirement", "position_m": 0.5, "action_price": 0.1}}),
+    ("auv_buoys", {}, {"filter": "kf", "reward": "tests.test_rewards:far_anchors"}),
+    ("drone_yard", {"links": LOSSY}, {"filter": "uc-kf", "reward": "error"}),
+    ("drone_yard", {}, {"filter": "iekf-bank/robust=true"}),
+    ("drone_yard", {"links": LOSSY}, {"filter": "iekf-cv"}),
+    ("drone_yard", {}, {"filter": "iekf-bias"}),
+    ("uwb_room", {}, {"filter": "kf-ortho", "observation": "flat"}),
+    ("uwb_room", {"inertial": "consumer"}, {"filter": "iekf-imu"}),
+    ("camsap2013", {}, {"filter": "et-kf", "options": {"threshold": 0.2}}),
+    ("satellite", {}, {"options": {"robust": True}, "observation": "flat"}),
+    ("hall", {}, {"observation": "tokens"}),
 ):
-    WORLDS[f"estimated, {scene['name']}, {filter}"] = estimated(scene, filter, **options)
+    scene = {"name": name, "steps": 4, **fields}
+    WORLDS[f"estimated, {name}, {options}"] = estimated(tracking(scene=scene), **options)
+for options in (
+    {}, {"reward": "worst-tag", "observation": "flat"},
+    # A filter that takes no tags of each world.
+    {"filter": "uc-kf"},
+):  # fmt: skip
+    world = tracking(scenes=test_families.VARIED, reward="bound")._replace(at_reset=("scene",))
+    WORLDS[f"estimated, drawn, {options}"] = estimated(world, **options)
+for kind in ("default", "drawn"):
+    for view in ("dict", "flat", "tokens")[: 2 if kind == "default" else 3]:
+        world = RAW[f"base station, {kind}"]
+        WORLDS[f"estimated, base station, {kind}, {view}"] = estimated(world, observation=view)
+for kind, options in (
+    ("bearings", {}),
+    ("lengths", {"reward": "belief", "order": "asynchronous", "cycles": "paton", "steps": 3}),
+):
+    wrappers = EstimateNetwork, VectorEstimateNetwork
+    WORLDS[f"estimated, network, {kind}"] = wrapped(
+        RAW[f"network, {kind}"], *(functools.partial(wrapper, **options) for wrapper in wrappers)
+    )
 for kind, scene in (("hall", test_select_anchors.HALL), ("movable", test_select_anchors.MOVABLE)):
     WORLDS[f"selected, {kind}"] = wrapped(
-        scene,
+        tracking(scene=scene),
         lambda env: EstimatePose(SelectAnchors(env)),
         lambda envs: VectorEstimatePose(VectorSelectAnchors(envs)),
     )

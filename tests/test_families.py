@@ -9,14 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose
-from tests.side_by_side import assert_masks_alike, assert_steps_alike, peer_of
 from tests.test_tracking_env import ID
 
 ROOM: dict[str, Any] = {
@@ -284,8 +282,6 @@ def test_scene_beside_scenes_is_refused():
 
 # --- many worlds ------------------------------------------------------------------------------
 
-# What a filter leaves of rounding.
-TOLERANCE = {"rtol": 2e-5, "atol": 2e-6}
 VARIED = [
     {"name": "hall", "steps": 5, "blocked_information": {"choice": [0.0, 0.1]}},
     {**ROOM, "links": {"drop_probability": 0.2, "nlos_probability": {"uniform": [0.0, 0.2]}}},
@@ -294,36 +290,6 @@ VARIED = [
     {"name": "auv_craft", "steps": 6, "n_anchors": {"integers": [2, 5]}},
     {"name": "satellite", "steps": 4, "links": {"reach_m": 120.0}},
 ]
-
-
-def side_by_side(mode, wrap, n=5, reward="bound") -> tuple[Any, Any]:
-    native = wrap[1](TrackingVectorEnv(n, scenes=VARIED, reward=reward, autoreset_mode=mode))
-    scalar = lambda: wrap[0](TrackingEnv(scenes=VARIED, reward=reward))  # noqa: E731
-    return native, peer_of(scalar, mode, n, {})
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize(
-    "wrap",
-    [
-        (lambda env: env, lambda env: env),
-        (EstimatePose, VectorEstimatePose),
-        (
-            lambda env: EstimatePose(env, reward="worst-tag", observation="flat"),
-            lambda env: VectorEstimatePose(env, reward="worst-tag", observation="flat"),
-        ),
-        # A filter that takes no tags of each world.
-        (lambda env: EstimatePose(env, "uc-kf"), lambda env: VectorEstimatePose(env, "uc-kf")),
-    ],
-    ids=["raw", "dict", "flat", "uc-kf"],
-)
-def test_world_i_equals_the_scalar_environment(mode, wrap):
-    assert_steps_alike(*side_by_side(mode, wrap), 16, 3, TOLERANCE)
-
-
-def test_masks_restart_only_some_worlds():
-    both = side_by_side(AutoresetMode.DISABLED, (EstimatePose, VectorEstimatePose))
-    assert_masks_alike(*both, 10, ("score_m",), TOLERANCE, ("scene",))
 
 
 def test_every_reset_draws_anew_and_says_so():

@@ -6,13 +6,11 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
 from rbl_gym.estimators.networks.beliefs import consensus
@@ -29,10 +27,6 @@ from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
-    assert_memory_is_not_shared,
-    assert_steps_alike,
-    of_its_spec,
-    peer_of,
 )
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
@@ -64,42 +58,6 @@ def test_gymnasiums_checker_has_no_complaint(arguments):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*different from the unwrapped version")
         check_env(EstimateNetwork(make(**arguments), reward="belief"))
-
-
-def test_specs_round_trip_with_the_wrapper():
-    env = EstimateNetwork(
-        make(n_nodes=5, steps=4, lengths="all", length_std_m=0.2), reward="belief",
-        cycles="minimum", kappa="trace", order="asynchronous", steps=7,
-    )  # fmt: skip
-    again = of_its_spec(env)
-    action = np.full(10, 0.3, np.float32)
-    assert_same(again.reset(seed=2), env.reset(seed=2))
-    assert_same(again.step(action), env.step(action))
-
-
-def test_memory_is_never_shared():
-    assert_memory_is_not_shared(lambda: VectorEstimateNetwork(make_vec(steps=4)), 6)
-
-
-@pytest.mark.parametrize("lengths", ["none", "one", "all"])
-@pytest.mark.parametrize(
-    "options",
-    [
-        None,
-        {},
-        {"reward": "belief", "order": "asynchronous", "cycles": "paton", "steps": 3},
-    ],
-    ids=["raw", "estimated", "in random order"],
-)
-def test_world_i_of_a_vector_is_the_scalar_environment(options, lengths):
-    vector: Any = make_vec(steps=5, lengths=lengths)
-    scalar: Any = lambda: make(steps=5, lengths=lengths).unwrapped  # noqa: E731
-    if options is not None:
-        vector = VectorEstimateNetwork(vector, **options)
-        scalar = lambda: EstimateNetwork(make(steps=5, lengths=lengths).unwrapped, **options)  # noqa: E731
-    peer = peer_of(scalar, AutoresetMode.NEXT_STEP, 3, {})
-    steps = assert_steps_alike(vector, peer, 5, 5, {"rtol": 1e-9, "atol": 1e-12})
-    assert steps[-1][3].all()
 
 
 # --- what it measures -------------------------------------------------------------------------

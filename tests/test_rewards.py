@@ -8,14 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rbl_gym.envs.tracking import TrackingEnv
-from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
+from rbl_gym.wrappers import EstimatePose
 from rbl_gym.wrappers.rewards import REWARDS, Outcome, reward_of
-from tests.helpers import assert_same
-from tests.side_by_side import actions_of
 from tests.test_tracking_vector_env import ID, short
 
 
@@ -73,31 +69,6 @@ def test_the_bound_is_told_where_the_environment_computes_it():
     _, got, info = step_of(short("uwb_room", 4), gap)
     assert got == pytest.approx(math.log(info["bound_m"] / info["score_m"]))
     assert step_of(short("uwb_room", 4), lambda o: float(o.bound_m is None), world="none")[1] == 1
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize(
-    "reward",
-    [
-        "worst-tag",
-        {"kind": "requirement", "position_m": 0.5, "action_price": 0.1},
-        far_anchors,
-        "tests.test_rewards:far_anchors",
-    ],
-    ids=["name", "dict", "function", "path"],
-)
-def test_vector_equals_scalar(mode, reward):
-    scene, n = short("auv_buoys", 4), 3
-    native = TrackingVectorEnv(n, scene, reward="none", autoreset_mode=mode)
-    native = VectorEstimatePose(native, reward=reward)
-    peer = SyncVectorEnv(
-        [lambda: EstimatePose(TrackingEnv(scene, "none"), reward=reward)] * n, autoreset_mode=mode
-    )
-    rng = np.random.default_rng(1)
-    _ = native.reset(seed=3), peer.reset(seed=3)
-    for _ in range(10):
-        actions = actions_of(native, rng)
-        assert_same(native.step(actions)[1], peer.step(actions)[1], rtol=2e-5, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", ["RBL/MobileAnchors-v0", "RBL/AnchorSelection-v0"])

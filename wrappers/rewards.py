@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -147,16 +148,16 @@ def _with_options(options: dict[str, Any]) -> Reward:
         check_number(f"reward.{name}", value, low=0.0)
     if kind == "requirement" and not options:
         raise ValueError("reward 'requirement' needs position_m or rotation_deg, or both")
+    reward = functools.partial(function, **options)
+    return functools.partial(_priced, reward, price) if price else reward
 
-    def paid(outcome: Outcome) -> FloatArray:
-        value = function(outcome, **options)
-        if not price:
-            return value
-        action = np.asarray(outcome.action, dtype=np.float64)
-        entries = action.ndim - value.ndim
-        return value - price * np.square(action).sum(axis=tuple(range(-entries, 0)))
 
-    return paid
+def _priced(reward: Reward, price: float, outcome: Outcome) -> FloatArray:
+    """Return the reward less the price of the action."""
+    value: Any = reward(outcome)
+    action = np.asarray(outcome.action, dtype=np.float64)
+    entries = action.ndim - value.ndim
+    return value - price * np.square(action).sum(axis=tuple(range(-entries, 0)))
 
 
 def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
