@@ -100,8 +100,8 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Info
     ----
-    `tag_error_m`: this error with the last anchor, and 0 before. `score_m` is still the prediction
-    of the bound.
+    `tag_error_m`: the root mean square error of the reward, metres, with the last anchor, and 0
+    before. `score_m` is still the prediction of the bound.
 
     Examples
     --------

@@ -161,7 +161,7 @@ class KalmanFamily:
         return KalmanState(mean, covariance.copy(), np.zeros(batch, bool))
 
     def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
-        """Return the state after `dt` seconds of the twist (..., 6): (10)-(15), Omega with dt."""
+        """Return the state after `dt` seconds of the twist (..., 6), by (10)-(15)."""
         state = plain(state)
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)

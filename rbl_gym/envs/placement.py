@@ -150,10 +150,10 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     ## Description
     Every episode draws a problem: a work region, which is a box inside the scene's volume. In rooms
     it also draws up to two racks that block the line of sight, besides the scene's own obstacles.
-    The agent places M anchors on the scene's legal surfaces. The score of a layout is the root mean
-    square error of the tag positions in metres. It depends on the errors of position and
-    orientation. The Cramer-Rao bound predicts it for 32 fixed poses in the region
-    (`rbl_gym.placement.score`).
+    The agent places M anchors on the scene's legal surfaces, those on which anchors may be. The
+    score of a layout is the root mean square error of the tag positions in metres. It depends on
+    the errors of position and orientation. The Cramer-Rao bound predicts it for 32 fixed poses in
+    the region (`rbl_gym.placement.score`).
 
     ## Action space
     * ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
@@ -222,7 +222,7 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     * `racks`: number of racks in a room, 0 to 2.
     * `n_anchors`: number M of anchors to place; None for the default of
       `rbl_gym.placement.task`.
-    * `mirror`: whether problems of symmetric scenes are observed mirrored.
+    * `mirror`: whether the environment mirrors the problems of symmetric scenes.
     * `sight`: whether to observe what each mount sees; only with racks or obstacles.
     * `observation`: ``"flat"``, ``"dict"``, ``"tokens"``, ``"module:function"`` or a function, see
       below.
