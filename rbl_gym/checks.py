@@ -178,7 +178,9 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be a number, got {value!r:.80}") from error
     if not abs(number) < HUGE or not low <= number <= high:
-        bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""
+        bounds = f" in [{low:g}, {high:g}]" if low > -math.inf else f" of at most {high:g}"
+        if high == math.inf:
+            bounds = f" of at least {low:g}" if low > -math.inf else ""
         raise ValueError(f"{name} must be a finite number{bounds}, got {number}")
     return number
 

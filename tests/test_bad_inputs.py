@@ -101,7 +101,7 @@ def test_epochs(name, changes, message):
     [
         (np.zeros(3), 1.0, r"twist must have shape \(..., 6\), got \(3,\)"),
         (np.full(6, np.nan), 1.0, "twist must be finite"),
-        (np.zeros(6), -1.0, r"dt must be a finite number in \[0, inf\], got -1.0"),
+        (np.zeros(6), -1.0, r"dt must be a finite number of at least 0, got -1.0"),
         (np.zeros(6), np.nan, "dt must be a finite number"),
         (np.zeros(6), "soon", "dt must be a number, got 'soon'"),
     ],

@@ -618,7 +618,7 @@ def test_what_is_wrong_names_file_topic_and_field(mapping, message, small, tmp_p
         assert str(small) in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["x.bag", "x.mcap", "x.db3", "x.csv"])
+@pytest.mark.parametrize("name", ["x.bag", "x.mcap", "x.db3"])
 def test_a_file_that_is_no_bag_is_refused_by_name(name, tmp_path):
     path = tmp_path / name
     path.write_bytes(b"#ROSBAG V2.0\n" + bytes(range(200)))
@@ -626,6 +626,9 @@ def test_a_file_that_is_no_bag_is_refused_by_name(name, tmp_path):
         recordings.list_topics(path)
     with pytest.raises(ValueError, match="no such file or folder"):
         recordings.list_topics(tmp_path / "absent.bag")
+    path.rename(tmp_path / "x.csv")
+    with pytest.raises(ValueError, match=r"x\.csv: must be a \.bag, \.db3 or \.mcap file"):
+        recordings.list_topics(tmp_path / "x.csv")
     with pytest.raises(ValueError, match=r"must have a file metadata\.yaml"):
         recordings.list_topics(tmp_path)
 

@@ -63,7 +63,7 @@ def test_good_number_comes_back_as_float(value):
     [
         (np.nan, {}, "dt must be a finite number, got nan"),
         (-np.inf, {}, "dt must be a finite number, got -inf"),
-        (-1, {"low": 0}, "dt must be a finite number in [0, inf], got -1.0"),
+        (-1, {"low": 0}, "dt must be a finite number of at least 0, got -1.0"),
         (2, {"low": 0, "high": 1}, "dt must be a finite number in [0, 1], got 2.0"),
         (None, {}, "dt must be a number, got None"),
         ([1.0, 2.0], {}, "dt must be a number, got [1.0, 2.0]"),

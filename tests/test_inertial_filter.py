@@ -178,7 +178,7 @@ def test_drifting_biases_of_links_are_forgotten():
     [
         ({"inertial": "best"}, "inertial.kind must be one of"),
         ({"speed_m_s": -1.0}, "speed_m_s must be a finite number"),
-        ({"gravity_tilt_rad": 3.0}, "gravity_tilt_rad must be a finite number in"),
+        ({"gravity_tilt_rad": 3.0}, "gravity_tilt_rad must be a finite number"),
         ({"headings": 0}, "headings must be a positive int, got 0"),
         ({"drift_std_m": 0.1, "drift_time_s": 0.0}, "time_s must be a finite number"),
     ],
@@ -194,7 +194,7 @@ def test_what_is_no_filter(options, message):
     [
         (np.zeros(6), 0.1, r"readings must have shape \(..., S, 6\), got \(6,\)"),
         (np.full((2, 6), np.nan), 0.1, "readings must be finite"),
-        (np.zeros((2, 6)), -0.1, "dt must be a finite number in"),
+        (np.zeros((2, 6)), -0.1, "dt must be a finite number"),
         (np.zeros((2, 6)), [0.1, -0.1], "dt must not be negative"),
         (np.zeros((2, 6)), "soon", "dt must be a number, got 'soon'"),
     ],

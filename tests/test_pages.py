@@ -17,7 +17,7 @@ pytest.importorskip("plotly", reason="the extra viz is not installed")
 
 from rbl_gym.app import page, solids, track_html, track_pages
 from rbl_gym.app.cli import main
-from rbl_gym.app.story import Beliefs, Story, errors_of
+from rbl_gym.app.story import Beliefs, Story, enlargement, errors_of
 from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import RADIUS_95
 from rbl_gym.studies.papers import camsap2013
@@ -252,6 +252,10 @@ def test_every_moment_changes_the_same_traces(known):
     for frame in shown.frames:
         assert [kinds[k] for k in frame.traces] == [type(trace) for trace in frame.data]
     assert len(shown.layout.sliders[0].steps) == 7
+
+
+def test_errors_of_a_body_with_one_tag_at_its_origin_are_not_enlarged():
+    assert enlargement(story()._replace(tags=np.zeros((1, 3)))) == 1.0
 
 
 def test_scenes_have_equal_scales():

@@ -298,7 +298,7 @@ def test_only_probabilities_need_uniforms(model, random):
 @pytest.mark.parametrize(
     ("kind", "fields", "message"),
     [
-        (RangeNoise, {"floor_m": -1}, "floor_m must be a finite number in [0, inf], got -1.0"),
+        (RangeNoise, {"floor_m": -1}, "floor_m must be a finite number of at least 0, got -1.0"),
         (RangeNoise, {"floor_m": "0.1"}, "floor_m must be a number, got '0.1'"),
         (RangeNoise, {"proportional": np.nan}, "proportional must be a finite number"),
         (RangeNoise, {"floor_m": 0.0}, "floor_m and proportional must not both be zero"),
@@ -306,12 +306,12 @@ def test_only_probabilities_need_uniforms(model, random):
         (RangeNoise, {"reference_tag": 1.0}, "reference_tag must be None or an int, got 1.0"),
         (RangeNoise, {"reference_tag": "a"}, "reference_tag must be None or an int, got 'a'"),
         (RangeNoise, {"reference_tag": np.nan}, "reference_tag must be None or an int, got nan"),
-        (SquaredRangeNoise, {"sigma_m": 0.0}, "sigma_m must be a finite number in"),
-        (SquaredRangeNoise, {"sigma_m": np.inf}, "sigma_m must be a finite number in"),
+        (SquaredRangeNoise, {"sigma_m": 0.0}, "sigma_m must be a finite number"),
+        (SquaredRangeNoise, {"sigma_m": np.inf}, "sigma_m must be a finite number"),
         (LinkModel, {"drop_probability": 1.1}, "drop_probability must be a finite number"),
         (LinkModel, {"nlos_probability": -0.1}, "nlos_probability must be a finite number"),
-        (LinkModel, {"nlos_bias_m": -1}, "nlos_bias_m must be a finite number in [0, inf]"),
-        (LinkModel, {"reach_m": -1}, "reach_m must be a finite number in [0, inf], got -1.0"),
+        (LinkModel, {"nlos_bias_m": -1}, "nlos_bias_m must be a finite number of at least 0"),
+        (LinkModel, {"reach_m": -1}, "reach_m must be a finite number of at least 0, got -1.0"),
     ],
 )
 def test_bad_parameter_is_refused(kind, fields, message):

@@ -336,9 +336,10 @@ def test_runs(tmp_path):
         read_recording(Files(**files))
     with pytest.raises(ValueError, match=r"has no run 'c', got \['b', 'a'\]"):
         read_recording(Files(**files), run="c")
-    assert [*read_runs(Files(**write(tmp_path, ranges=many(5), anchors=ANCHORS, tags=TAGS)))] == [
-        ""
-    ]
+    files = Files(**write(tmp_path, ranges=many(5), anchors=ANCHORS, tags=TAGS))
+    with pytest.raises(ValueError, match="has no run 'c', as it has no column run"):
+        read_recording(files, run="c")
+    assert [*read_runs(files)] == [""]
 
 
 def test_truth_of_runs(tmp_path):

@@ -208,9 +208,9 @@ def test_corners_from_lists_are_equal_and_hashable(kind):
         (Box, ((0, 0, 0), (1, np.nan, 1)), "high must be finite, got nan at index (1,)"),
         (Walls, ((0, 0, 0), "abc"), "high must be an array of real numbers, got 'abc'"),
         (Box, (((0, 0, 0), (0, 0, 0)), (1, 1, 1)), "low must"),
-        (Shell, (-1, 2), "inner_m must be a finite number in [0, inf], got -1.0"),
-        (Shell, (3, 2), "outer_m must be a finite number in [3, inf], got 2.0"),
-        (Shell, (0, np.inf), "outer_m must be a finite number in [0, inf], got inf"),
+        (Shell, (-1, 2), "inner_m must be a finite number of at least 0, got -1.0"),
+        (Shell, (3, 2), "outer_m must be a finite number of at least 3, got 2.0"),
+        (Shell, (0, np.inf), "outer_m must be a finite number of at least 0, got inf"),
         (Shell, ("1", 2), "inner_m must be a number, got '1'"),
     ],
 )

@@ -98,9 +98,9 @@ def _reproduce(options: argparse.Namespace) -> int:
     from rbl_gym.app import papers
 
     experiment = papers.experiments()[options.experiment]
-    named = ("positions", "footprints", "variance")
+    named = {"positions": "--positions", "footprints": "--footprint", "variance": "--variance"}
     given = {name: getattr(options, name) for name in named if getattr(options, name) is not None}
-    if wrong := [name for name in given if name not in experiment.options]:
+    if wrong := [named[name] for name in given if name not in experiment.options]:
         raise ValueError(f"{options.experiment} has no option {' and no option '.join(wrong)}")
     with progress(options.experiment) as advance:
         result = experiment.run(options.trials, options.seed, advance, **given)

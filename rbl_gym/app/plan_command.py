@@ -40,6 +40,11 @@ def _plan(options: argparse.Namespace) -> int:
     if is_plan(path):
         plan = read_plan(path, options, options.anchors)
         tables, said, layers = plan.tables, plan.said, plan_report.layer_rows(plan)
+    elif not path.lower().endswith((".toml", ".json")):
+        raise ValueError(
+            f"{path}: must be a drawing (.dxf, .geojson), a picture (.png, .jpg) or a building "
+            "file (.toml, .json)"
+        )
     elif options.out:
         raise ValueError(f"{path}: --out needs a drawing or a picture, got a building file")
     else:

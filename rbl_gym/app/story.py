@@ -88,4 +88,4 @@ def enlargement(story: Story) -> float:
     widest = [np.sqrt(np.linalg.eigvalsh(belief.covariance[:, 3:, 3:])[:, -1])
               for belief in story.beliefs.values()]  # fmt: skip
     usual = RADIUS_95 * float(np.median(np.concatenate(widest)))
-    return max(1.0, round_number(0.6 * size / max(usual, 1e-12)))
+    return round_number(max(1.0, 0.6 * size / max(usual, 1e-12)))

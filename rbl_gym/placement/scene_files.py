@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import placement
-from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.geometry.obstacles import Obstacles, Prisms, inside
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements.gain import Gain
@@ -78,7 +78,7 @@ def problem(
             line = line_of(path.read_text(encoding="utf-8"), str(error))
             where = "" if line is None or path.suffix.lower() != ".toml" else f" (line {line})"
             raise ValueError(f"{scene}: {error}{where}") from error
-    known = scenes.get(check_one_of("scene", scene, list(scenes.SCENES)))
+    known = scenes.get(scene)
     task = placement.task(known, n_anchors, racks)
     context = placement.whole_volume(task)
     if racks:

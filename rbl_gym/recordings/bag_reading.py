@@ -52,6 +52,10 @@ def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
                 f"{path}: the folder of a ROS 2 bag must have a file metadata.yaml, this one has "
                 "none"
             )
+        if path.is_file() and path.suffix not in (".bag", ".db3", ".mcap"):
+            raise ValueError(
+                f"{path}: must be a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag"
+            )
     # ROS 2 bags without definitions come from Humble or older.
     store = get_typestore(Stores.ROS2_HUMBLE)
     if messages is not None:

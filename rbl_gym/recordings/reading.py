@@ -70,7 +70,8 @@ def read_recording(
         )
     if run is not None:
         if run not in runs:
-            raise ValueError(f"{table.path}: has no run {run!r}, got {[*runs]!r:.200}")
+            held = f"got {[*runs]!r:.200}" if "run" in table.columns else "as it has no column run"
+            raise ValueError(f"{table.path}: has no run {run!r}, {held}")
         table = table.select(runs[run])
     return _read(files, table, run, format)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import as_tuples, check_array, check_one_of, imported
+from rbl_gym.checks import as_tuples, check_array, imported
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
@@ -250,7 +250,12 @@ def _named(name: Any) -> Scene:
     suffix = PurePath(name).suffix.lower() if isinstance(name, str) else ""
     if suffix in READERS and name not in SCENES:
         return imported("scene", READERS[suffix])(name)
-    return SCENES[check_one_of("scene", name, list(SCENES))]
+    if not isinstance(name, str) or name not in SCENES:
+        raise ValueError(
+            f"scene must be one of {', '.join(map(repr, SCENES))}, or a .toml or .json file; got "
+            f"{name!r:.80}"
+        )
+    return SCENES[name]
 
 
 def _stretched(scene: Scene, stretch: Any) -> Scene:

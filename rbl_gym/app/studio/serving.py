@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import re
@@ -19,6 +20,7 @@ _PORTS = 50
 BRAND = (24, 100, 171)
 # Origins of pages that this machine serves, on any port.
 _LOOPBACK = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
+_FOREIGN = "host must be an address of this machine, got {!r}"
 
 
 def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym studio") -> Any:
@@ -89,12 +91,14 @@ def _free_port(host: str, first: int) -> int:
                 host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
             )[0]
         except OSError as error:
-            raise ValueError(f"host must be an address of this machine, got {host!r}") from error
+            raise ValueError(_FOREIGN.format(host)) from error
         with socket.socket(family, kind, number) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind(address)
-            except OSError:
+            except OSError as error:
+                if error.errno == errno.EADDRNOTAVAIL:
+                    raise ValueError(_FOREIGN.format(host)) from error
                 continue
             return probe.getsockname()[1]
     raise ValueError(f"no port is free on {host!r} from {first} on")

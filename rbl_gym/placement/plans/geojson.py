@@ -28,7 +28,7 @@ def read_geojson(
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: not a GeoJSON file: {error}") from error
     shapes, unread = [], {}
     names = _LAYER_NAMES if layer_property is None else (layer_property,)
     for number, (geometry, properties) in enumerate(_features(data, path)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -202,6 +203,8 @@ def load(path: str | Path) -> AnyPolicy:
     """
     # numpy leaves the file open if it is not an archive.
     data = io.BytesIO(Path(path).read_bytes())
+    if not zipfile.is_zipfile(data):
+        raise ValueError(f"{path} is not a policy of rbl-gym: must be a .npz file of rbl-gym train")
     try:
         with np.load(data, allow_pickle=False) as file:
             meta = json.loads(str(file[_META]))

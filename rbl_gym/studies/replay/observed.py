@@ -72,11 +72,11 @@ def known_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], l
             f"the rotation, except that about the body's axis {_axis(found.turn_axes[-1, :, 0])}",
             f"the rotation about the body's axis {_axis(found.turn_axes[-1, :, 2])}",
         )[int(found.turns[-1])]
-        std = f"{spread.max():.0f} deg" if spread.max() < 180 else "beyond 180 deg"
+        std = f"{spread.max():.0f} deg" if spread.max() < 180 else "above 180 deg"
         notes.append(_note(what, std, _since(found.turns, times)))
     if found.places[-1] < 3:
         spread = found.place_std[-1].max()
-        notes.append(_note("the place", f"{spread:.3g} m", _since(found.places, times)))
+        notes.append(_note("the position", f"{spread:.3g} m", _since(found.places, times)))
     return result, notes
 
 
@@ -98,8 +98,8 @@ def _axis(axis: FloatArray) -> str:
 
 
 def _note(what: str, std: str, since: float) -> str:
-    when = "from the start" if since == 0 else f"since {since:.1f} s"
+    when = "since the start" if since == 0 else f"since {since:.1f} s after the start"
     return (
-        f"Note: the ranges do not determine {what}: standard deviation {std} at the end, {when}. "
-        "The covariance includes this."
+        f"Note: the ranges do not determine {what} ({when}): its standard deviation is {std} at "
+        "the end. The covariance includes this."
     )
