@@ -167,6 +167,15 @@ def test_replay_without_truth_prints_no_errors(files, capsys):
     assert "no truth, so no errors" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    "given", ["--yaw-offset-deg=7", "--truth-gap-s=1", "--truth-exclude=1:2", "--align=yaw"]
+)
+def test_replay_options_of_the_comparison_need_a_truth(files, capsys, given):
+    del files["truth"]
+    assert main([*arguments(files), given]) != 0
+    assert f"{given.partition('=')[0]} needs --truth" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
 @pytest.mark.long
 def test_replay_of_a_real_planar_recording(tmp_path):

@@ -27,6 +27,7 @@ from rbl_gym.app.terminal import (
 
 # Law of the biases of uncalibrated radios: constant, learned.
 _RAW = {"bias_std_m": 0.05, "bias_time_s": None, "bias_common_m": 0.1}
+_COMPARISON = ("yaw_offset_deg", "truth_gap_s", "truth_exclude", "align")
 
 
 def add_replay(commands: Any) -> None:
@@ -232,6 +233,7 @@ def _replay(options: argparse.Namespace) -> int:
     settings = _settings(options)
     runs = read_runs(options)
     # Report errors before the work begins.
+    _check_compared(options, runs)
     for recording in runs.values() if len(runs) == 1 else ():
         replay.check_replay(recording, settings)
     settings, clocks = found_clocks(options, runs, settings)
@@ -328,6 +330,15 @@ def _settings(options: argparse.Namespace) -> Any:
         option = of_log[0].replace("_", "-")
         raise ValueError(f"--{option} needs the filter iekf-log, got {name}")
     return settings
+
+
+def _check_compared(options: argparse.Namespace, runs: Mapping[str, Any]) -> None:
+    """Raise ValueError if an option of the comparison is given, but no truth."""
+    if any(recording.truth is not None for recording in runs.values()):
+        return
+    given = [name for name in _COMPARISON if getattr(options, name) is not None]
+    if given:
+        raise ValueError(f"--{given[0].replace('_', '-')} needs --truth")
 
 
 def _start(text: str) -> tuple[float, ...]:
