@@ -118,7 +118,7 @@ def test_what_the_adapter_says_and_refuses():
     assert envs.env_is_wrapped(Monitor) == [True] * 3
     assert envs.env_is_wrapped(gym.Wrapper, [0]) == [False]
     assert envs.get_attr("num_envs", [0, 2]) == [3, 3]
-    with pytest.raises(NotImplementedError, match="have no attributes"):
+    with pytest.raises(NotImplementedError, match="share their attributes"):
         envs.set_attr("scene", None)
     with pytest.raises(NotImplementedError, match="have no methods"):
         envs.env_method("reset")

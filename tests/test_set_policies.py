@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,7 @@ from rbl_gym.studies.learning.policies import Lstm, Policy
 from rbl_gym.studies.learning.rl_tasks import rl_task
 from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
 from rbl_gym.wrappers import craft_tokens, sight_tokens
-from rbl_gym.wrappers.controllers import greedy
+from rbl_gym.wrappers.controllers import MOBILE, greedy
 from rbl_gym.wrappers.situations import situations
 
 
@@ -248,6 +249,20 @@ def test_scalar_worlds_are_played_as_in_the_vector_environment(kind, task):
     other = rl_task("auv_buoys").make(1)
     with pytest.raises(ValueError, match="does not fit"):
         policies.check_fit(policy, "mine", other)
+
+
+@pytest.mark.parametrize("m", [2, 3, 5])
+def test_three_craft_or_more_stay_near_the_orbit(m):
+    scene = {"name": "auv_craft", "n_anchors": m}
+    envs: Any = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=16, scene=scene)
+    seen, _ = envs.reset(seed=4)
+    net = network("craft")
+    loud = DeepSets(net.inner, (*net.outer[:-1], (100 * net.outer[-1][0], net.outer[-1][1])))
+    actions = SetPolicy(loud, "craft", {}).player()(envs.unwrapped, seen)
+    orbit = MOBILE["orbit"](envs.unwrapped, np.random.default_rng(0))
+    change = np.linalg.norm((actions - orbit).reshape(16, m, 2), axis=-1)
+    # Cutting to the largest speed brings two velocities together, never apart.
+    assert (change.max() > 0.5) if m == 2 else (0.1 < change.max() < 0.2 + 1e-6)
 
 
 # --- sight ------------------------------------------------------------------------------------

@@ -108,17 +108,16 @@ def _placement(steps: int, n_anchors: int, **arguments: Any) -> RlTask:
     return RlTask("RBL/AnchorPlacement-v0", arguments, steps, 4 * n_anchors)
 
 
-# Two slow craft need the most skill: they are drawn twice as often as all others together.
+# Two slow craft need the most skill: they are drawn in more than half of the worlds. Three slow
+# ones are the next.
 _SLOW_PAIR = {"name": "auv_craft", "n_anchors": 2, "anchor_speed_m_s": 2.0}
-CRAFT = (
-    _SLOW_PAIR,
-    _SLOW_PAIR,
-    {
-        "name": "auv_craft",
-        "n_anchors": {"integers": [2, 5]},
-        "anchor_speed_m_s": {"choice": [2.0, 4.0, 4.0]},
-    },
-)
+_SLOW_THREE = {**_SLOW_PAIR, "n_anchors": 3}
+_DRAWN_CRAFT = {
+    "name": "auv_craft",
+    "n_anchors": {"integers": [2, 5]},
+    "anchor_speed_m_s": {"choice": [2.0, 4.0, 4.0]},
+}
+CRAFT = (*(_SLOW_PAIR,) * 3, _SLOW_THREE, _DRAWN_CRAFT, _DRAWN_CRAFT)
 _RACK = {
     "choice": [
         [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 0.5, 4.0, 1.5],
@@ -143,7 +142,7 @@ TASKS: dict[str, RlTask] = {
     "mobile-easy": _mobile(600_000, 50, difficulty="easy"),
     "mobile-hard": _mobile(1_500_000, 13, difficulty="hard"),
     "craft": RlTask(
-        "RBL/MobileAnchors-v0", {"scenes": CRAFT}, 1_500_000, 20, algorithm="set-ppo",
+        "RBL/MobileAnchors-v0", {"scenes": CRAFT}, 2_500_000, 20, algorithm="set-ppo",
         gamma=0.95, gae_lambda=0.9, num_envs=128,
     ),
     "selection": _selection(k=3),
