@@ -94,13 +94,14 @@ class UnknownTwist(NamedTuple):
     twist
         True twist (..., 6) of the interval.
     dt, process, law
-        Seconds, and the laws of pose and twist.
+        Seconds, one number (`smoothing.smoothing_crb` takes one for each interval), and the laws of
+        pose and twist.
     sensor
         Sensor of the twist of the interval; None: not measured.
     """
 
     twist: ArrayLike
-    dt: float
+    dt: ArrayLike
     process: ProcessNoise
     law: WanderingTwist
     sensor: TwistSensor | None = None
@@ -129,7 +130,9 @@ class UnknownTwist(NamedTuple):
             J = np.broadcast_to(J, (*batch, *J.shape[-2:])).copy()
             J[..., :12, :12] += told
         P = inverse(J)
-        return inverse(twist.predict_covariance(P, move, self.dt, self.process, self.law))
+        return inverse(
+            twist.predict_covariance(P, move, float(self.seconds), self.process, self.law)
+        )
 
 
 class InertialMotion(NamedTuple):
