@@ -308,7 +308,7 @@ def check_one_process(process: ProcessNoise) -> ProcessNoise:
     """Return the process noise, or raise ValueError if each trial has its own."""
     if np.ndim(process.std()) > 1:
         raise ValueError(
-            "process must be the same for all trials, as only the filter 'iekf' takes leading "
-            f"axes, got {process.std().shape[:-1]}"
+            "process must be the same for all trials, got leading axes "
+            f"{process.std().shape[:-1]}; only the filter 'iekf' takes a process for each trial"
         )
     return process

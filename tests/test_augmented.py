@@ -273,7 +273,7 @@ def test_biases_are_forgotten_as_their_law_says(twist):
     ("changes", "message"),
     [
         ({"law": 0.1}, "law must be a LinkBias, got 0.1"),
-        ({"times": [1.0, 0.0]}, r"times must be \(K,\) and not decrease, got array"),
+        ({"times": [1.0, 0.0]}, r"times must have shape \(K,\) and not decrease, got array"),
         ({"links": 2.5}, "links must be a positive int, got 2.5"),
         ({"rng": 7}, "rng must be a numpy.random.Generator, got 7"),
     ],
@@ -331,7 +331,7 @@ def test_what_cannot_be_is_refused():
         iekf_bias(tags, NOISE, PROCESS, bias_std_m=-1)
     with pytest.raises(ValueError, match="time_s must be a finite number"):
         iekf_bias(tags, NOISE, PROCESS, bias_time_s=0)
-    with pytest.raises(ValueError, match="times must be"):
+    with pytest.raises(ValueError, match="times must have"):
         link_bias.simulate_biases(LinkBias(), [1.0, 0.0], 3, rng)
     with pytest.raises(ValueError, match="has no option 'bias_std_m'"):
         estimators.make("iekf-cv", tags=tags, noise=NOISE, process=PROCESS, bias_std_m=1)

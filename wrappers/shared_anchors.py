@@ -339,8 +339,8 @@ def family_of_bodies(scene: Any, bodies: Any) -> SceneFamily:
     for index, one in enumerate(made):
         if one.survey_std_m > 0:
             raise ValueError(
-                f"bodies[{index}] must have survey_std_m = 0: all bodies see the same anchors, got "
-                f"{one.survey_std_m:g}"
+                f"bodies[{index}] must have survey_std_m = 0, got {one.survey_std_m:g}: all bodies "
+                "see the same anchors"
             )
         for name in _ALIKE:
             if getattr(one, name) != getattr(made[0], name):

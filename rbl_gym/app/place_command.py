@@ -211,7 +211,7 @@ def _numbers(text: str) -> range:
     first, dots, last = text.partition("..")
     numbers = range(positive(first), positive(last if dots else first) + 1)
     if not numbers:
-        raise argparse.ArgumentTypeError(f"must rise from A to B, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be N or A..B with A at most B, got {text!r}")
     return numbers
 
 

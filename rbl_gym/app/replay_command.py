@@ -328,7 +328,7 @@ def _settings(options: argparse.Namespace) -> Any:
     of_log = [key for key in given if key.startswith(("constant_", "drift_"))]
     if of_log and name not in ("iekf-log", "iekf-imu"):
         option = of_log[0].replace("_", "-")
-        raise ValueError(f"--{option} needs the filter iekf-log, got {name}")
+        raise ValueError(f"--{option} needs the filter iekf-log or iekf-imu, got {name}")
     return settings
 
 

@@ -75,7 +75,7 @@ def simulate_biases(
         raise ValueError(f"law must be a LinkBias, got {law!r:.80}")
     times = check_array("times", times, ("K",))
     if times.ndim != 1 or (np.diff(times) < 0).any():
-        raise ValueError(f"times must be (K,) and not decrease, got {times!r:.80}")
+        raise ValueError(f"times must have shape (K,) and not decrease, got {times!r:.80}")
     links = check_count("links", links)
     check_generator("rng", rng)
     normals = rng.standard_normal((len(times), *batch, links + 1))

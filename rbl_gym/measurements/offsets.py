@@ -96,7 +96,7 @@ def simulate_clocks(
         raise ValueError(f"law must be a Clock, got {law!r:.80}")
     times = check_array("times", times, ("K",))
     if times.ndim != 1 or (np.diff(times) < 0).any():
-        raise ValueError(f"times must be (K,) and not decrease, got {times!r:.80}")
+        raise ValueError(f"times must have shape (K,) and not decrease, got {times!r:.80}")
     groups = check_count("groups", groups)
     check_generator("rng", rng)
     normals = rng.standard_normal((len(times), *batch, groups, 2))

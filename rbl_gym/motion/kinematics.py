@@ -70,7 +70,7 @@ class ProcessNoise:
             np.broadcast_shapes(*shapes)
         except ValueError as error:
             raise ValueError(
-                f"rotation_rad and translation_m must broadcast, got shapes {shapes}"
+                f"rotation_rad and translation_m must broadcast together, got shapes {shapes}"
             ) from error
 
     def std(self) -> FloatArray:

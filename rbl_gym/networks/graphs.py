@@ -187,7 +187,7 @@ def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: in
     C.eliminate_zeros()
     if not (np.abs(C.data) == 1).all():
         wrong = C.data[np.abs(C.data) != 1][0]
-        raise ValueError(f"cycles must have entries -1, 0 and 1, got {wrong:g}")
+        raise ValueError(f"cycles must have only the entries -1, 0 and 1, got {wrong:g}")
     open_ = np.unique((C @ incidence(edges, n_nodes)).nonzero()[0])
     if len(open_):
         raise ValueError(f"cycles must be closed walks, but row {open_[0]} is an open one")

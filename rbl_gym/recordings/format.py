@@ -77,7 +77,7 @@ class Files:
                 "carrier needs anchors: a table of the anchors in the frame of the carrier"
             )
         if self.relative and self.carrier is None:
-            raise ValueError("relative needs a carrier")
+            raise ValueError("relative needs a carrier: the poses of the body with the anchors")
         if self.imu_frame is not None and self.imu is None:
             raise ValueError("imu_frame needs imu")
 

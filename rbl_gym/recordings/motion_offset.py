@@ -109,7 +109,10 @@ def _turned(rotation: FloatArray) -> FloatArray:
 def _rates(times: FloatArray, path: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
     """Return times (n,) on a grid and the smoothed rates (n, D) of a path (K, D), without gaps."""
     if len(times) < 2 or np.ptp(times) < 4 * width:
-        raise ValueError(f"a track must last {4 * width:.3g} s or longer, got {len(times)} poses")
+        lasts = np.ptp(times) if len(times) else 0.0
+        raise ValueError(
+            f"a track must last {4 * width:.3g} s or longer, got {lasts:.3g} s ({len(times)} poses)"
+        )
     step = width / _FINE
     count = int(np.ptp(times) / step) + 1
     if count > _MOST_POINTS:

@@ -84,7 +84,7 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
                 )
     rows, numbers, cut = _rows(path, lines, start, header, comma)
     if not rows:
-        raise ValueError(f"{path}: must have a header and rows, got 1 lines")
+        raise ValueError(f"{path}: must have a header and rows, got only one line")
     decimal = "."
     if comma != "," and _DECIMAL_COMMA.search(text := "\n".join(lines[first:])):
         decimal = ","

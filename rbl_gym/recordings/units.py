@@ -108,8 +108,8 @@ def _check_pairs(
         apart = np.broadcast_to(distance, both.shape)[both]
         if np.median(total / apart) < _SUM:
             raise ValueError(
-                f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart "
-                f"and the sum of two ranges to them is {np.median(total):.4g} m "
+                f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart, "
+                f"but the sum of the ranges to two of them is {np.median(total):.4g} m "
                 "(looks like centimetres or millimetres?)"
             )
     some = slice(None, None, 1 + len(ranges) // _EPOCHS)
@@ -120,8 +120,8 @@ def _check_pairs(
         apart = np.broadcast_to(distance, both.shape)[both]
         if np.median(gap / apart) > _TOO_NEAR and np.median(gap) > _NOISE * typical:
             raise ValueError(
-                f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart "
-                f"and ranges to them differ by {np.median(gap):.4g} m"
+                f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart, "
+                f"but the ranges to them differ by {np.median(gap):.4g} m"
             )
 
 
@@ -149,9 +149,10 @@ def _check_spread(
     seen = float(np.quantile(share, 0.9))
     if seen < _BROADSIDE:
         raise ValueError(
-            f"{path}: units look inconsistent, tags are up to {distance.max():.4g} m apart and "
-            f"ranges of one anchor to two of them differ by {100 * seen:.2g} % of their distance "
-            f"at most (looks like {'millimetres' if seen < _MILLI else 'centimetres'}?)"
+            f"{path}: units look inconsistent, tags are up to {distance.max():.4g} m apart, "
+            f"but the ranges of an anchor to two tags differ by {100 * seen:.2g} % of the distance "
+            "of the tags, or less "
+            f"(looks like {'millimetres' if seen < _MILLI else 'centimetres'}?)"
         )
 
 

@@ -132,7 +132,7 @@ def network_experiment(
         else sorted(check_number("footprint", radius, low=0.0) for radius in footprints)
     )
     if not radii:
-        raise ValueError("footprint must be at least one radius, got none")
+        raise ValueError("footprints must have at least one radius, got none")
     advance(0, more=4)
     graphs = [_seen(places, radius) for radius in radii]
     result: dict[str, Any] = {"experiment": "network2009", "trials": trials, "seed": seed}
