@@ -183,7 +183,7 @@ def main() -> None:
         options.played = amortised.read(Path(options.network))
     asked = options.families.split(",") if options.families else [*FAMILIES, "buildings"]
     heads = (f"{f'after {n}':>6}  [95 %]        time" for n in EVALUATIONS)
-    print(f"{'':18}", *(f"{head:31}" for head in heads), "  worst of one pass")
+    print(f"{'':18}", *(f"{head:31}" for head in heads), "  worst without evaluations")
     for name, (scene, racks) in FAMILIES.items():
         if not any(name.startswith(one) for one in asked):
             continue

@@ -1,8 +1,9 @@
-"""Layouts from a network trained on many problems: one pass, no search.
+"""Layouts from a network trained on many problems: one pass, without the score.
 
-Tokens of the problem and one token per anchor attend to each other. In boxes, shells and rooms each
-anchor's token gives a position, which the region projects to a legal one. On other mounts it
-chooses among candidates. `rbl_gym.studies.learning.amortised` trains the network.
+In boxes, shells and rooms the network gives a position for each anchor, which the region projects
+to a legal one. On other mounts each anchor chooses among candidates. Where something is in the way,
+some anchors are then exchanged for candidates by `dilution`.
+`rbl_gym.studies.learning.amortised` trains the network.
 """
 
 from __future__ import annotations
@@ -16,18 +17,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_count
+from rbl_gym.checks import BoolArray, FloatArray, check_count
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
-from rbl_gym.placement import scenery, setting, swaps
+from rbl_gym.placement import dilution, scenery, setting, swaps
+from rbl_gym.placement.attention import MOST, chosen, forward
 from rbl_gym.placement.building import Problem, cube
-from rbl_gym.placement.descent import descend
+from rbl_gym.placement.following import follow
+from rbl_gym.placement.gradient import of_arrays
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.placement.sample import sample
 from rbl_gym.placement.tokens import (
     KINDS,
     Scenery,
-    Tokens,
+    shown_of,
     tokens_of,
     turned,
     turned_points,
@@ -35,16 +38,16 @@ from rbl_gym.placement.tokens import (
 
 __all__ = ["Network", "load", "of_problem", "of_task", "read"]
 
-# Largest number of anchors, and number of attention heads.
-MOST, HEADS = 16, 4
 _FILE = "amortised.npz"
 # Numbers of positions for the score and gradient of a building, and of legal positions tried
 # instead of one inside an obstacle.
 _STEP_PLACES, _SPOTS = 256, 512
 # Where something is in the way: numbers of mirror images to compare, and of swaps after them.
 _IMAGES, _SWAPS = 2, 10
-# Contexts whose swaps are done at once.
-_AT_ONCE = 16
+# Largest numbers of exchanges by the dilution of precision.
+_EXCHANGES = {"walls": 2, "mounts": 12}
+# Contexts that are placed at once, with swaps and without.
+_AT_ONCE = {True: 16, False: 256}
 
 
 class Network(NamedTuple):
@@ -68,102 +71,6 @@ def read(path: Any) -> Network:
     return Network(weights, meta)
 
 
-def shapes(sizes: dict[str, int], width: int, layers: int) -> dict[str, tuple[int, ...]]:
-    """Return names and shapes of the weights; `sizes` are the lengths of the token rows."""
-    found: dict[str, tuple[int, ...]] = {
-        f"{kind}.weight": (sizes[kind], width) for kind in Tokens._fields
-    }
-    found |= {"candidates.bias": (width,), "candidates.mix": (width, width)}
-    found |= {"ordinal": (MOST, width), "count": (MOST, width), "pattern.weight": (3, width)}
-    for layer in range(layers):
-        name = f"layer{layer}"
-        for norm in ("first", "second"):
-            found |= {f"{name}.{norm}.scale": (width,), f"{name}.{norm}.bias": (width,)}
-        found |= {f"{name}.query": (width, width), f"{name}.seen": (width, 2 * width)}
-        found |= {f"{name}.out": (width, width), f"{name}.up": (width, 4 * width)}
-        found |= {f"{name}.up.bias": (4 * width,), f"{name}.down": (4 * width, width)}
-    found |= {"last.scale": (width,), "last.bias": (width,)}
-    found |= {"action": (width, 3), "action.bias": (3,)}
-    return found | {"point.query": (width, width), "point.key": (width, width)}
-
-
-def pattern(count: int) -> FloatArray:
-    """Return a ring (M, 3), alternately low and high, to which the network's steps are added."""
-    angle = 2 * np.pi * (np.arange(count) + 0.5) / count
-    height = np.where(np.arange(count) % 2, 0.5, -0.5)
-    return np.stack([np.cos(angle), np.sin(angle), height], axis=-1)
-
-
-def forward(
-    weights: dict[str, FloatArray], tokens: Tokens, count: int, total: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return steps (..., M, 3) of the anchors, and scores (..., M, C) of the candidates.
-
-    Parameters
-    ----------
-    weights
-        Weights of a `Network`.
-    tokens
-        Tokens of the problem.
-    count, total
-        Number of placed anchors, and of all anchors with the fixed ones.
-    """
-    w = weights
-    width, numbers = w["ordinal"].shape[1], w["ordinal"].dtype
-    tokens = Tokens(*(rows.astype(numbers) for rows in tokens))
-    batch = tokens.world.shape[:-2]
-    ring = pattern(count).astype(numbers)
-    anchors = w["ordinal"][:count] + w["count"][min(total, MOST) - 1] + ring @ w["pattern.weight"]
-    rows, masks = [], []
-    for kind in ("world", "zones", "obstacles", "fixed"):
-        row = getattr(tokens, kind)
-        if row.shape[-2]:
-            rows.append(row @ w[f"{kind}.weight"])
-            masks.append(row[..., 0] > 0)
-    rows.append(np.broadcast_to(anchors, (*batch, count, width)))
-    masks.append(np.ones((*batch, count), dtype=np.bool_))
-    x = np.concatenate(rows, axis=-2)
-    spots = _silu(tokens.candidates @ w["candidates.weight"] + w["candidates.bias"])
-    spots = spots @ w["candidates.mix"]
-    real = tokens.candidates[..., 0] > 0
-    mask = np.concatenate([*masks, real], axis=-1)
-    hidden = None if mask.all() else np.where(mask, 0.0, -np.inf)[..., None, None, :]
-    layer = 0
-    while (name := f"layer{layer}") + ".query" in w:
-        y = _normed(x, w[f"{name}.first.scale"], w[f"{name}.first.bias"])
-        seen = np.concatenate([y, spots], axis=-2) @ w[f"{name}.seen"]
-        key, value = _heads(seen[..., :width]), _heads(seen[..., width:])
-        query = _heads(y @ w[f"{name}.query"]) * (HEADS / width) ** 0.5
-        attention = query @ np.swapaxes(key, -1, -2)
-        if hidden is not None:
-            attention = attention + hidden
-        attention = np.exp(attention - attention.max(axis=-1, keepdims=True))
-        attention /= attention.sum(axis=-1, keepdims=True)
-        mixed = np.swapaxes(attention @ value, -2, -3)
-        x = x + mixed.reshape(x.shape) @ w[f"{name}.out"]
-        y = _normed(x, w[f"{name}.second.scale"], w[f"{name}.second.bias"])
-        x = x + _silu(y @ w[f"{name}.up"] + w[f"{name}.up.bias"]) @ w[f"{name}.down"]
-        layer += 1
-    x = _normed(x[..., -count:, :], w["last.scale"], w["last.bias"])
-    steps = x @ w["action"] + w["action.bias"] + ring
-    key = spots @ w["point.key"]
-    scores = (x @ w["point.query"]) @ np.swapaxes(key, -1, -2) / math.sqrt(width)
-    return steps, np.where(real[..., None, :], scores, -np.inf)
-
-
-def _heads(x: FloatArray) -> FloatArray:
-    return np.swapaxes(x.reshape(*x.shape[:-1], HEADS, -1), -2, -3)
-
-
-def _normed(x: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
-    x = x - x.mean(axis=-1, keepdims=True)
-    return x / np.sqrt((x**2).mean(axis=-1, keepdims=True) + 1e-5) * scale + bias
-
-
-def _silu(x: FloatArray) -> FloatArray:
-    return x / (1 + np.exp(-x))
-
-
 class _Play(NamedTuple):
     """A problem with all that the network needs.
 
@@ -177,44 +84,67 @@ class _Play(NamedTuple):
         Returns legal positions (..., M, 3) for points of any kind.
     count
         Number of anchors to place.
+    weight
+        Weights (P,) of the places of `seen`.
     """
 
     seen: Scenery
     share: Callable[[FloatArray], FloatArray]
     legal: Callable[[FloatArray], FloatArray]
     count: int
+    weight: FloatArray
 
 
 def _placed(network: Network, play: _Play, image: int = 0) -> FloatArray:
-    """Return anchors (..., M, 3) of one pass of the network, on one of the mirror images."""
+    """Return anchors (..., M, 3) of one pass of the network, on one of the mirror images.
+
+    Among candidates they are exchanged by the dilution of precision.
+    """
     seen = turned(play.seen, image) if image else play.seen
     total = play.count + seen.fixed.shape[-2]
     steps, scores = forward(network.weights, tokens_of(seen, play.count), play.count, total)
     if KINDS[seen.kind] == "mounts":
-        index = _chosen(scores)
-        return np.take_along_axis(play.seen.candidates, index[..., None], axis=-2)
-    _, unit = seen.frame()
-    points = seen.aim()[..., None, :] + unit[..., None, None] * steps
-    return play.legal(turned_points(points, image, back=True))
+        index = chosen(scores)[..., None]
+        points = np.take_along_axis(play.seen.candidates, index, axis=-2)
+    else:
+        _, unit = seen.frame()
+        points = seen.aim()[..., None, :] + unit[..., None, None] * steps
+        points = play.legal(turned_points(points, image, back=True))
+    return _exchanged(play, points) if seen.candidates.shape[-2] else points
 
 
-def _chosen(scores: FloatArray) -> np.ndarray:
-    """Return the candidates (..., M) with the largest scores (..., M, C), each at most once."""
-    scores = scores.copy()
-    found = []
-    for m in range(scores.shape[-2]):
-        best = scores[..., m, :].argmax(axis=-1)[..., None]
-        found.append(best)
-        if scores.shape[-1] > m + 1:
-            np.put_along_axis(scores, best[..., None, :], -np.inf, axis=-1)
-    return np.concatenate(found, axis=-1)
+def _exchanged(play: _Play, points: FloatArray) -> FloatArray:
+    """Return anchors (..., M, 3) after exchanges for candidates, without the score."""
+    seen = shown_of(play.seen)
+    shares = play.share(points), play.share(seen.fixed), seen.seen
+    parts = dilution.Parts(
+        *(
+            dilution.links_of(seen, x, share)
+            for x, share in zip((points, seen.fixed, seen.candidates), shares, strict=True)
+        )
+    )
+    return dilution.exchanged(
+        play.weight,
+        (2 / seen.extent) ** 2,
+        parts,
+        ~_illegal(play, seen.candidates),
+        _EXCHANGES[KINDS[seen.kind]],
+    )
+
+
+def _illegal(play: _Play, candidates: FloatArray) -> BoolArray:
+    """Return which candidates (..., C) are not legal positions."""
+    if KINDS[play.seen.kind] == "mounts":
+        return np.zeros(candidates.shape[:-1], dtype=np.bool_)
+    away = np.abs(play.legal(candidates) - candidates).max(axis=-1)
+    return away > 1e-6 * play.seen.frame()[1][..., None]
 
 
 def _swapped(
-    network: Network, play: _Play, poses: swaps.Poses, evaluations: int
+    network: Network, play: _Play, bound: swaps.Bound, evaluations: int
 ) -> tuple[FloatArray, int]:
     """Return anchors (..., M, 3) after mirror images and swaps, and the number of evaluations."""
-    bound, candidates = swaps.bound_of(play.seen, poses), play.seen.candidates
+    candidates = play.seen.candidates
 
     def judged(points: FloatArray) -> swaps.State:
         return swaps.evaluated(bound, points, play.share(points))
@@ -223,8 +153,7 @@ def _swapped(
     for image in range(1, min(_IMAGES, evaluations)):
         best, _ = swaps.better(best, judged(_placed(network, play, image)))
         used += 1
-    away = np.abs(play.legal(candidates) - candidates).max(axis=-1)
-    illegal = (away > 1e-6 * play.seen.frame()[1][..., None])[..., None, :]
+    illegal = _illegal(play, candidates)[..., None, :]
     tried = illegal | swaps.occupied(best.points, candidates)
     while used < min(_IMAGES + _SWAPS, evaluations) and (best.decrease > 0)[~tried].any():
         points, pair = swaps.swapped(best, candidates, tried)
@@ -242,6 +171,9 @@ def of_task(
     network: Network | None = None,
 ) -> FloatArray:
     """Return layouts (..., M, 3) of a task in contexts (...).
+
+    With obstacles, or on mounts, some anchors are exchanged after the network by `dilution`,
+    without the score.
 
     Parameters
     ----------
@@ -263,33 +195,59 @@ def of_task(
     check_count("n_anchors", task.n_anchors, least=1, most=MOST)
     evaluations = check_count("evaluations", evaluations, least=0)
     batch, network = context.centre.shape[:-1], network or load()
+    number = math.prod(batch)
+    flat = [field.reshape(number, *field.shape[len(batch) :]) for field in context]
     swap = evaluations > 1 and bool(task.obstacles(context))
-    if swap and math.prod(batch) > _AT_ONCE:
-        flat = [field.reshape(-1, *field.shape[len(batch) :]) for field in context]
-        some = [slice(k, k + _AT_ONCE) for k in range(0, len(flat[0]), _AT_ONCE)]
-        found = [
-            of_task(task, Context(*(field[part] for field in flat)), evaluations, network)
-            for part in some
-        ]
-        return np.concatenate(found).reshape(*batch, task.n_anchors, 3)
+    size, found = _AT_ONCE[swap], np.zeros((number, task.n_anchors, 3))
+    for k in range(0, number, size):
+        part = Context(*(field[k : k + size] for field in flat))
+        found[k : k + size] = _of_contexts(task, part, evaluations, network, swap)
+    return found.reshape(*batch, task.n_anchors, 3)
+
+
+def _of_contexts(
+    task: PlacementTask, context: Context, evaluations: int, network: Network, swap: bool
+) -> FloatArray:
+    """Return the layouts (C, M, 3) of contexts."""
+    scene, obstacles = task.scene, task.obstacles(context)
     seen = scenery.of_task(task, context, swap)
 
     def legal(points: FloatArray) -> FloatArray:
-        return _legal(task.scene.anchor_region, task.scene.obstruction, points)
+        return _legal(scene.anchor_region, scene.obstruction, points)
 
     def share(points: FloatArray) -> FloatArray:
-        return task.obstacles(context).share(points, seen.places)
+        return obstacles.share(points, seen.places)
 
-    play, used = _Play(seen, share, legal, task.n_anchors), 0
+    play, used = (
+        _Play(seen, share, legal, task.n_anchors, np.full(task.n_poses, 1 / task.n_poses)),
+        0,
+    )
+    if not evaluations:
+        return _placed(network, play)
+    poses = scenery.poses_of_task(task, seen, context)
+    bound = swaps.bound_of(seen, poses)
+
+    def evaluate(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        links = share(points)[..., None]
+        return of_arrays(
+            points,
+            scene.anchor_region.normal(points) if scene.gain else 0 * points,
+            *(poses.rotation, seen.places, poses.weight, bound.prior, seen.tags, poses.law),
+            scene.gain.numbers,
+            np.broadcast_to(links, (*links.shape[:-1], len(seen.tags))),
+        )
+
+    def free(points: FloatArray) -> BoolArray:
+        each = (task.obstacles(Context(*row)) for row in zip(*context, strict=True))
+        return ~np.stack([one.contain(x) for one, x in zip(each, points, strict=True)])
+
     if swap:
-        poses = scenery.poses_of_task(task, seen, context)
-        found, used = _swapped(network, play, poses, evaluations)
+        found, used = _swapped(network, play, bound, evaluations)
     else:
         found = _placed(network, play)
     if evaluations > used:
-        for where in np.ndindex(batch):
-            one = setting.of_task(task, Context(*(field[where] for field in context)))
-            found[where], _ = descend(one, found[where], evaluations - used, strict=True)
+        left, checked = evaluations - used, free if obstacles else None
+        found = follow(evaluate, scene.anchor_region, found, left, checked)
     return found
 
 
@@ -328,15 +286,21 @@ def of_problem(
     def share(points: FloatArray) -> FloatArray:
         return problem.share(points, seen.places)
 
-    play, used = _Play(seen, share, legal, count), 0
+    play, used = _Play(seen, share, legal, count, drawn.weight), 0
     if swap:
-        poses = scenery.poses_of_problem(problem, drawn)
-        found, used = _swapped(network, play, poses, evaluations)
+        bound = swaps.bound_of(seen, scenery.poses_of_problem(problem, drawn))
+        found, used = _swapped(network, play, bound, evaluations)
     else:
         found = _placed(network, play)
     if evaluations > used:
         judged = setting.of_problem(problem, sample(problem, _STEP_PLACES))
-        found, _ = descend(judged, found, evaluations - used, strict=True)
+
+        def evaluate(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+            score, gradient = judged.score_and_gradient(points[0])
+            return np.array([score]), gradient[None]
+
+        left = evaluations - used
+        found = follow(evaluate, problem.mounts, found[None], left, judged.legal)[0]
     return np.concatenate([problem.fixed, found])
 
 

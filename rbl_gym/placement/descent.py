@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 from typing import Any
 
 import numpy as np
@@ -15,15 +13,11 @@ from rbl_gym.placement.setting import Setting
 __all__ = ["descend"]
 
 # Unit of length of the search: a fraction of the region's largest extent.
-_UNIT = 0.1
-
-
-class _SpentError(Exception):
-    """No evaluations are left."""
+UNIT = 0.1
 
 
 def descend(
-    setting: Setting, anchors: FloatArray, evaluations: int = 30, strict: bool = False
+    setting: Setting, anchors: FloatArray, evaluations: int = 30
 ) -> tuple[FloatArray, float]:
     """Minimize the log of the score of all anchors (M, 3) by L-BFGS-B, each within its face.
 
@@ -32,9 +26,7 @@ def descend(
     setting, anchors
         The problem, and where to begin.
     evaluations
-        Largest number of evaluations of score and gradient.
-    strict
-        Whether to stop at that number within a line search. Otherwise the last one is finished.
+        Number of evaluations of score and gradient. The last line search is finished.
 
     Returns
     -------
@@ -43,7 +35,7 @@ def descend(
     from scipy import optimize  # slow to import
 
     region = setting.region
-    unit = _UNIT * float(np.ptp(region.bounds(), axis=0).max())
+    unit = UNIT * float(np.ptp(region.bounds(), axis=0).max())
     face = region.face_of(anchors)
     origin, axes, extents = (array[face] for array in region.faces[:3])
     start, limits = anchors, None
@@ -51,11 +43,8 @@ def descend(
         start = np.einsum("mai,mi->ma", axes, anchors - origin).clip(0.0, extents)
         limits = np.stack([np.zeros(start.shape), extents / unit], axis=-1).reshape(-1, 2)
     best: list[Any] = [anchors, np.inf]
-    left = itertools.count(evaluations, -1)
 
     def evaluate(values: FloatArray) -> tuple[float, FloatArray]:
-        if not next(left) and strict:
-            raise _SpentError
         values = unit * values.reshape(-1, 3)
         if limits is None:
             layout = region.project(values)
@@ -65,20 +54,19 @@ def descend(
         if score < best[1]:
             best[:] = layout, score
         if limits is None:
-            slope = _pulled_back(gradient, values, layout)
+            slope = pulled_back(gradient, values, layout)
         else:
             slope = np.einsum("mai,mi->ma", axes, gradient)
         return float(np.log(score)), (slope * (unit / score)).ravel()
 
-    with contextlib.suppress(_SpentError):
-        optimize.minimize(
-            evaluate,
-            (start / unit).ravel(),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=limits,
-            options={"maxfun": evaluations, "maxiter": evaluations, "ftol": 1e-7, "gtol": 1e-6},
-        )
+    optimize.minimize(
+        evaluate,
+        (start / unit).ravel(),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=limits,
+        options={"maxfun": evaluations, "maxiter": evaluations, "ftol": 1e-7, "gtol": 1e-6},
+    )
     found, score = best
     legal = setting.legal(found)
     if legal.all():
@@ -89,7 +77,7 @@ def descend(
     return (found, score) if score < before else (anchors, before)
 
 
-def _pulled_back(gradient: FloatArray, free: FloatArray, points: FloatArray) -> FloatArray:
+def pulled_back(gradient: FloatArray, free: FloatArray, points: FloatArray) -> FloatArray:
     """Return the derivative with respect to free points, from that at the nearest shell points."""
     length = np.linalg.norm(free, axis=-1, keepdims=True)
     ratio = np.linalg.norm(points, axis=-1, keepdims=True) / length

@@ -173,12 +173,7 @@ def tokens_of(seen: Scenery, count: int) -> Tokens:
     obstacles = [solid, place_row(centre), _size(half), share, np.log10(share + 1e-3) / 3]
     one = np.ones((*seen.fixed.shape[:-1], 1))
     fixed = [one, place_row((seen.fixed - at) / by)]
-    if seen.shown is not None:
-        seen = seen._replace(
-            candidates=seen.candidates[..., : seen.shown, :],
-            normals=seen.normals[..., : seen.shown, :],
-            seen=seen.seen[..., : seen.shown],
-        )
+    seen = shown_of(seen)
     one = np.ones((*seen.candidates.shape[:-1], 1))
     where = place_row((seen.candidates - at) / by)
     candidates = [one, where, seen.normals, _views(seen)]
@@ -188,6 +183,18 @@ def tokens_of(seen: Scenery, count: int) -> Tokens:
         _joined(*obstacles) * solid,
         _joined(*fixed),
         _joined(*candidates),
+    )
+
+
+def shown_of(seen: Scenery) -> Scenery:
+    """Return the scenery with only those candidates of which there are tokens."""
+    if seen.shown is None:
+        return seen
+    return seen._replace(
+        candidates=seen.candidates[..., : seen.shown, :],
+        normals=seen.normals[..., : seen.shown, :],
+        seen=seen.seen[..., : seen.shown],
+        shown=None,
     )
 
 

@@ -14,10 +14,10 @@ from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
 from rbl_gym.measurements.gain import Gain
-from rbl_gym.placement import amortised
+from rbl_gym.placement import attention
 from rbl_gym.placement.gradient import square_and_gradient
 
-_HEADS = amortised.HEADS
+_HEADS = attention.HEADS
 
 
 class Network(nn.Module):
@@ -33,7 +33,7 @@ class Network(nn.Module):
 
     def __init__(self, sizes: dict[str, int], width: int = 64, layers: int = 4) -> None:
         super().__init__()
-        arrays: dict[str, tuple[int, ...]] = amortised.shapes(sizes, width, layers)
+        arrays: dict[str, tuple[int, ...]] = attention.shapes(sizes, width, layers)
         self.weights = nn.ParameterDict()
         for name, shape in arrays.items():
             if name.endswith("bias"):
@@ -56,7 +56,7 @@ class Network(nn.Module):
         }
 
     def forward(self, tokens: Any, count: int, total: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return steps (B, M, 3) and scores of candidates (B, M, C), as `amortised.forward`."""
+        """Return steps (B, M, 3) and scores of candidates (B, M, C), as `attention.forward`."""
         w = {name.replace("/", "."): value for name, value in self.weights.items()}
         rows, masks = [], []
         for kind in ("world", "zones", "obstacles", "fixed"):
@@ -64,8 +64,8 @@ class Network(nn.Module):
             rows.append(row @ w[f"{kind}.weight"])
             masks.append(row[..., 0] > 0)
         batch = rows[0].shape[0]
-        pattern = torch.as_tensor(amortised.pattern(count), dtype=rows[0].dtype)
-        anchors = w["ordinal"][:count] + w["count"][min(total, amortised.MOST) - 1]
+        pattern = torch.as_tensor(attention.pattern(count), dtype=rows[0].dtype)
+        anchors = w["ordinal"][:count] + w["count"][min(total, attention.MOST) - 1]
         anchors = anchors + pattern @ w["pattern.weight"]
         rows.append(anchors.expand(batch, -1, -1))
         masks.append(torch.ones(batch, count, dtype=torch.bool))
