@@ -21,6 +21,9 @@ from numba.core.types import Array, BaseFunction, BaseTuple, Boolean, Number, un
 # Oldest and newest version of numba with which this was tried.
 _TRIED = ((0, 61), (0, 68))
 
+# Fused multiply-add, a seventh of the time of an update. NaN and infinity remain what they are.
+FUSED = {"contract"}
+
 try:
     if not _TRIED[0] <= tuple(map(int, numba.__version__.split(".")[:2])) <= _TRIED[1]:
         raise ImportError
@@ -58,7 +61,8 @@ def compile_helper(function: Any, unrolled: bool, **options: Any) -> Callable[..
 
     `unrolled` compiles once for each layout, and optimizes completely before inlining.
     """
-    options |= {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {"error_model": "numpy", "fastmath": FUSED}
     if Compiler is None:
         return _njit(**options)(function)
     options["pipeline_class"] = _UnrolledCompiler if unrolled else _HelperCompiler

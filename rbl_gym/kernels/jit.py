@@ -1,4 +1,4 @@
-"""Compilation and storage of kernels: numba, without fast math, cached by contents.
+"""Compilation and storage of kernels: numba, without fast math but for FMA, cached by contents.
 
 Only modules of kernels import this one. It imports numba.
 """
@@ -15,7 +15,7 @@ from typing import IO, Any, TypeVar, cast
 
 import numba
 
-from rbl_gym.kernels.helper_code import as_code, compile_helper, types_remembered
+from rbl_gym.kernels.helper_code import FUSED, as_code, compile_helper, types_remembered
 
 try:
     import fcntl
@@ -119,7 +119,7 @@ def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any,
     numba compiles the function, then the loop over trials with the function inlined. Only the
     second step is optimized.
     """
-    made: Any = numba.guvectorize(signature, cache=_KEPT)(function)
+    made: Any = numba.guvectorize(signature, cache=_KEPT, fastmath=FUSED)(function)
     with as_code():
         made.add(arguments)
     made.disable_compile()
