@@ -3,8 +3,9 @@
 - simdkalman (many trials that share H, F, Q, R) against the batched KF's shared covariance;
 - stonesoup (one body) against the KF of one body, and of a batch of bodies of their own;
 - gtsam (one epoch: Levenberg-Marquardt on ranges from anchors to tags on a Pose3) against the
-  iterated EKF, both with a prior of the pose, and without one against `locate(method="ml")`,
-  which besides refining a start, as gtsam does, looks for the start and for other solutions.
+  iterated EKF (predict, update and belief), both with a prior of the pose, and without one against
+  `locate(method="ml")`, which besides refining a start, as gtsam does, looks for the start and for
+  other solutions.
 
 The peers get their models ready-made, whitened matrices or a factor graph, and start from our
 start; ours start from ranges. The results are checked equal first. Process time, one thread,
@@ -35,6 +36,7 @@ RANGES = ranging.RangeNoise(0.05)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
 DT, STEPS = 0.1, 5
 PRIOR_RAD, PRIOR_M = 0.1, 0.5
+REST = np.zeros(6)
 TRIALS, BODIES, PROBLEMS, PEER_PROBLEMS = 1024, 8, 512, 20
 
 
@@ -286,11 +288,12 @@ class Epochs:
         covariance = np.diag([PRIOR_RAD**2] * 3 + [PRIOR_M**2] * 3)
         self.prior = self.filter.initial(turned, moved, covariance)
 
-    def iekf(self, which: int | slice, iterations: int = 4) -> Any:
-        """Posterior state of one body, or of several at once."""
-        filter = replace(self.filter, iterations=iterations)  # pyright: ignore[reportArgumentType]
+    def iekf(self, which: int | slice, filter: Any = None) -> Any:
+        """Belief of one body, or of several at once, after predict (at rest) and update."""
+        filter = filter or self.filter
         state = type(self.prior)(*(field[which] for field in self.prior))
-        return filter.update(state, self.ranges[which], self.anchors[which])
+        state = filter.predict(state, REST, 0.0)
+        return filter.belief(filter.update(state, self.ranges[which], self.anchors[which]))
 
     def locate(self, which: int | slice) -> Any:
         """Maximum likelihood of one epoch, or of several at once, without the prior."""
@@ -352,14 +355,14 @@ def against_gtsam(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
                 require_equal("gtsam: translation", found.translation[k], pose.translation(), 1e-5)
 
         def one_by_one() -> None:
-            for k in range(PEER_PROBLEMS):
+            for k in range(PROBLEMS):
                 ours[1](k)
 
         jobs = {
             f"{ours[0]}, {PROBLEMS} epochs": side_by_side.Job(
                 lambda: ours[1](slice(None)), PROBLEMS
             ),
-            f"{ours[0]}, one epoch": side_by_side.Job(one_by_one, PEER_PROBLEMS),
+            f"{ours[0]}, one epoch": side_by_side.Job(one_by_one, PROBLEMS),
         }
         ready = side_by_side.Job(lambda: [solve(*inputs) for inputs in graphs], PEER_PROBLEMS)
         built = side_by_side.Job(
@@ -372,13 +375,14 @@ def against_gtsam(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
         ]
 
     everything = slice(None)
+    exact = replace(epochs.filter, iterations=30)  # pyright: ignore[reportArgumentType]
     cls = estimators.locate(epochs.ranges, epochs.anchors, epochs.tags, RANGES, "cls")
     return [
         *duels(
             "with prior",
             (epochs.prior.rotation, epochs.prior.translation),
             ("iekf", epochs.iekf),
-            lambda: epochs.iekf(everything, 30),
+            lambda: epochs.iekf(everything, exact),
             prior=True,
         ),
         *duels(
