@@ -211,7 +211,7 @@ class Standstill(Wrapped):
 @pytest.mark.parametrize(
     ("broken", "check", "message"),
     [
-        (NoBelief, "interface", "must have the method 'belief', but NoBelief has not"),
+        (NoBelief, "interface", "must have the method 'belief', but NoBelief has none"),
         (OneBody, "shapes", r"initial must accept .* raised IndexError\('too many bodies'\)"),
         (FlatCovariance, "shapes", r"belief.covariance must be .* \(6, 6\), got float64 \(36,\)"),
         (Single, "shapes", r"belief.translation must be a float64 array .* got float32"),
