@@ -148,7 +148,10 @@ def test_truth_files(tmp_path):
 ERRORS = {
     "empty": ({"ranges": ""}, r"ranges.csv: must have a header and rows, got 0 lines"),
     "only comments": ({"tags": "# none\n\n"}, r"tags.csv: must have a header and rows, got 0"),
-    "header only": ({"anchors": "anchor,x,y,z\n"}, r"anchors.csv: must have .* rows, got 1 lines"),
+    "header only": (
+        {"anchors": "anchor,x,y,z\n"},
+        r"anchors.csv: must have .* rows, got only one line",
+    ),
     "binary": ({"ranges": b"\x93NUMPY\x01\x00"}, r"ranges.csv: must be UTF-8 text, .* at 0"),
     "utf-16": ({"tags": TAGS.encode("utf-16")}, r"tags.csv: must be UTF-8 text"),
     "zeros": (

@@ -198,7 +198,7 @@ def with_offset(settings: Settings, found: TimeOffset | None) -> Settings:
 def _mode(settings: Settings, planar: bool) -> str:
     mode = settings.comparison.align
     if mode == "se3" and planar:
-        raise ValueError("align must not be 'se3' if the motion is planar: use 'yaw'")
+        raise ValueError("planar motion has no heights to align: use 'yaw'")
     return mode
 
 
