@@ -60,34 +60,43 @@ def minimize_pose(
     """
     at = linearize(rotation, translation)
     batch = at.cost.shape
-    rotation = np.broadcast_to(rotation, (*batch, 3, 3))
-    translation = np.broadcast_to(translation, (*batch, 3))
-    damping = np.zeros(batch)
-    converged = np.zeros(batch, bool)
+    pose = np.broadcast_to(rotation, (*batch, 3, 3)), np.broadcast_to(translation, (*batch, 3))
+    found, damping = Solution(*pose, at, np.zeros(batch, bool)), np.zeros(batch)
     for _ in range(iterations):
-        step = -damped_solution(at.hessian, at.gradient, damping)
-        # With almost no information, the square of a step may overflow.
-        step = np.clip(step, -_LONGEST, _LONGEST)
-        turned, moved = _EXP(step[..., :3]) @ rotation, translation + step[..., 3:]
-        new = linearize(turned, moved)
-        # Damping shortens the step by about 1 + damping, so a short step does not show convergence.
-        decrease = -np.einsum("...i,...i->...", at.gradient, step) * (1 + damping)
-        # A step of 1e-4 standard deviations changes the cost by less than rounding can.
-        better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
-        taken = better & ~converged
-        rotation = np.where(taken[..., None, None], turned, rotation)
-        translation = np.where(taken[..., None], moved, translation)
-        at = Linearization(
-            np.where(taken, new.cost, at.cost),
-            np.where(taken[..., None], new.gradient, at.gradient),
-            np.where(taken[..., None, None], new.hessian, at.hessian),
-        )
-        eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
-        damping = np.where(better, eased, np.maximum(10 * damping, 1e-3))
-        converged = converged | (decrease < tolerance**2)
-        if converged.all():
+        found, damping = _stepped(linearize, found, damping, tolerance)
+        if found.converged.all():
             break
-    return Solution(rotation, translation, at, converged)
+    return found
+
+
+def _stepped(
+    linearize: Callable[[FloatArray, FloatArray], Linearization],
+    found: Solution,
+    damping: FloatArray,
+    tolerance: float,
+) -> tuple[Solution, FloatArray]:
+    """Return the solution after one more step, and the damping of the next."""
+    rotation, translation, at, converged = found
+    step = -damped_solution(at.hessian, at.gradient, damping)
+    # With almost no information, the square of a step may overflow.
+    step = np.clip(step, -_LONGEST, _LONGEST)
+    turned, moved = _EXP(step[..., :3]) @ rotation, translation + step[..., 3:]
+    new = linearize(turned, moved)
+    # Damping shortens the step by about 1 + damping, so a short step does not show convergence.
+    decrease = -np.einsum("...i,...i->...", at.gradient, step) * (1 + damping)
+    # A step of 1e-4 standard deviations changes the cost by less than rounding can.
+    better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
+    taken = better & ~converged
+    at = Linearization(
+        np.where(taken, new.cost, at.cost),
+        np.where(taken[..., None], new.gradient, at.gradient),
+        np.where(taken[..., None, None], new.hessian, at.hessian),
+    )
+    rotation = np.where(taken[..., None, None], turned, rotation)
+    translation = np.where(taken[..., None], moved, translation)
+    eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
+    damping = np.where(better, eased, np.maximum(10 * damping, 1e-3))
+    return Solution(rotation, translation, at, converged | (decrease < tolerance**2)), damping
 
 
 def damped_solution(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:

@@ -8,6 +8,8 @@ of a trial do not determine a solution, its entries are NaN, which the caller mu
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rbl_gym.bounds.pose import information_rank
@@ -82,38 +84,59 @@ def _newton_by(
 ) -> tuple[FloatArray, FloatArray]:
     batch = np.broadcast_shapes(weight.shape[:-2], target.shape[:-1], start.shape[:-2])
     Q = np.broadcast_to(start, (*batch, 3, 3))
+    at = _Iterate(Q, *_pull(weight, target, Q), np.zeros(batch))
+    for _ in range(_ITERATIONS):
+        step, length = _newton_step(weight, at)
+        Q = RETRACTIONS[retraction](step) @ at.rotation
+        at = _better(at, Q, *_pull(weight, target, Q))
+        if (length < 1e-13).all():
+            break
+    return at.rotation, at.cost
+
+
+class _Iterate(NamedTuple):
+    """Rotation Q (..., 3, 3), W (vec Q - q) (..., 9), cost (...) and damping (...)."""
+
+    rotation: FloatArray
+    pull: FloatArray
+    cost: FloatArray
+    damping: FloatArray
+
+
+def _pull(weight: FloatArray, target: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     residual = vec(Q) - target
     pull = (weight @ residual[..., None])[..., 0]
-    cost = 0.5 * np.einsum("...i,...i->...", residual, pull)
-    damping = np.zeros(batch)
-    for _ in range(_ITERATIONS):
-        tangent = vec(_E @ Q[..., None, :, :])  # (..., 3, 9): derivative of vec Q
-        gradient = (tangent @ pull[..., None])[..., 0]
-        gauss = tangent @ weight @ np.swapaxes(tangent, -1, -2)
-        curvature = np.einsum("...k,...ijk->...ij", pull, vec(_EE @ Q[..., None, None, :, :]))
-        hessian = gauss + curvature
-        smallest = np.linalg.eigvalsh(hessian)[..., 0]
-        scale = np.trace(gauss, axis1=-2, axis2=-1)
-        shift = np.maximum(0.0, 1e-9 * scale - smallest) * 1.5 + damping * scale + 1e-300
-        # If a weight is only rounding noise, as for tags at one point, nothing else is certain.
-        shift += 1e-15 * np.abs(hessian).max(axis=(-2, -1))
-        step = -np.linalg.solve(hessian + shift[..., None, None] * np.eye(3), gradient[..., None])
-        step = step[..., 0]
-        # A step of more than 90 degrees leaves the region where the quadratic model is valid.
-        length = np.linalg.norm(step, axis=-1, keepdims=True)
-        step = step * np.minimum(1.0, 1.5 / np.maximum(length, 1e-300))
-        candidate = RETRACTIONS[retraction](step) @ Q
-        new_residual = vec(candidate) - target
-        new_pull = (weight @ new_residual[..., None])[..., 0]
-        new_cost = 0.5 * np.einsum("...i,...i->...", new_residual, new_pull)
-        better = new_cost <= cost * (1 + 1e-12)
-        Q = np.where(better[..., None, None], candidate, Q)
-        pull = np.where(better[..., None], new_pull, pull)
-        cost = np.where(better, new_cost, cost)
-        damping = np.where(better, 0.1 * damping, np.maximum(10 * damping, 1e-3))
-        if (length[..., 0] < 1e-13).all():
-            break
-    return Q, cost
+    return pull, 0.5 * np.einsum("...i,...i->...", residual, pull)
+
+
+def _newton_step(weight: FloatArray, at: _Iterate) -> tuple[FloatArray, FloatArray]:
+    """Return the step (..., 3) on the tangent space and its length (...) before it was cut."""
+    tangent = vec(_E @ at.rotation[..., None, :, :])  # (..., 3, 9): derivative of vec Q
+    gradient = (tangent @ at.pull[..., None])[..., 0]
+    gauss = tangent @ weight @ np.swapaxes(tangent, -1, -2)
+    turned = vec(_EE @ at.rotation[..., None, None, :, :])
+    hessian = gauss + np.einsum("...k,...ijk->...ij", at.pull, turned)
+    smallest = np.linalg.eigvalsh(hessian)[..., 0]
+    scale = np.trace(gauss, axis1=-2, axis2=-1)
+    shift = np.maximum(0.0, 1e-9 * scale - smallest) * 1.5 + at.damping * scale + 1e-300
+    # If a weight is only rounding noise, as for tags at one point, nothing else is certain.
+    shift += 1e-15 * np.abs(hessian).max(axis=(-2, -1))
+    step = -np.linalg.solve(hessian + shift[..., None, None] * np.eye(3), gradient[..., None])
+    step = step[..., 0]
+    # A step of more than 90 degrees leaves the region where the quadratic model is valid.
+    length = np.linalg.norm(step, axis=-1, keepdims=True)
+    return step * np.minimum(1.0, 1.5 / np.maximum(length, 1e-300)), length[..., 0]
+
+
+def _better(at: _Iterate, Q: FloatArray, pull: FloatArray, cost: FloatArray) -> _Iterate:
+    """Take a candidate where its cost is not larger; damp less there, and more elsewhere."""
+    better = cost <= at.cost * (1 + 1e-12)
+    return _Iterate(
+        np.where(better[..., None, None], Q, at.rotation),
+        np.where(better[..., None], pull, at.pull),
+        np.where(better, cost, at.cost),
+        np.where(better, 0.1 * at.damping, np.maximum(10 * at.damping, 1e-3)),
+    )
 
 
 def linear_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:

@@ -51,15 +51,23 @@ class ParticleSwarm:
         velocity = np.zeros_like(x)
         best, best_cost = x.copy(), objective(x)
         for _ in range(self.steps):
-            leader = _at(best, best_cost.argmin(axis=-1))
-            own, common = self.attraction * rng.random((2, *x.shape))
-            velocity = self.inertia * velocity + own * (best - x) + common * (leader[..., None] - x)
-            x = np.clip(x + velocity, 0.0, 1.0)
-            cost = objective(x)
-            better = cost < best_cost
-            best = np.where(better, x, best)
-            best_cost = np.where(better, cost, best_cost)
+            x, velocity = self._moved(x, velocity, best, best_cost, rng)
+            best, best_cost = _better(best, best_cost, x, objective(x))
             yield _at(best, best_cost.argmin(axis=-1))
+
+    def _moved(
+        self,
+        x: FloatArray,
+        velocity: FloatArray,
+        best: FloatArray,
+        best_cost: FloatArray,
+        rng: np.random.Generator,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the next positions and velocities."""
+        leader = _at(best, best_cost.argmin(axis=-1))
+        own, common = self.attraction * rng.random((2, *x.shape))
+        velocity = self.inertia * velocity + own * (best - x) + common * (leader[..., None] - x)
+        return np.clip(x + velocity, 0.0, 1.0), velocity
 
 
 @dataclass(frozen=True)
@@ -92,23 +100,25 @@ class ParticipatorySearch:
         """Return the best distances (K, B) after each step, in units of `reach`."""
         x = rng.random((*shape, self.size))
         cost = objective(x)
-        power = 1 - self.arousal
         for _ in range(self.steps):
-            best = _at(x, cost.argmin(axis=-1))[..., None]
-            other = np.roll(x, rng.integers(1, self.size), axis=-1)
-            nearer = _compatibility(x, best) >= _compatibility(other, best)
-            selected = np.where(nearer, x, other)
-            recombined = x + self.learning_rate * _compatibility(x, other) ** power * (other - x)
-            change = _compatibility(selected, recombined) ** power * (selected - recombined)
-            child = np.clip(best + change, 0.0, 1.0)
-            child_cost = objective(child)
-            better = child_cost < cost
-            x, cost = np.where(better, child, x), np.where(better, child_cost, cost)
+            child = self._children(x, cost, rng)
+            x, cost = _better(x, cost, child, objective(child))
             worst = np.argpartition(-cost, self.fresh, axis=-1)[..., : self.fresh]
             new = rng.random((*shape, self.fresh))
             np.put_along_axis(x, np.broadcast_to(worst, new.shape), new, axis=-1)
             np.put_along_axis(cost, worst, objective(new), axis=-1)
             yield _at(x, cost.argmin(axis=-1))
+
+    def _children(self, x: FloatArray, cost: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return the mutated individuals of a step, one for each."""
+        power = 1 - self.arousal
+        best = _at(x, cost.argmin(axis=-1))[..., None]
+        other = np.roll(x, rng.integers(1, self.size), axis=-1)
+        nearer = _compatibility(x, best) >= _compatibility(other, best)
+        selected = np.where(nearer, x, other)
+        recombined = x + self.learning_rate * _compatibility(x, other) ** power * (other - x)
+        change = _compatibility(selected, recombined) ** power * (selected - recombined)
+        return np.clip(best + change, 0.0, 1.0)
 
 
 def search_places(
@@ -173,6 +183,14 @@ def _farthest(
     for ends in pairs:
         np.minimum.at(farthest, ends, most)
     return farthest
+
+
+def _better(
+    x: FloatArray, cost: FloatArray, other: FloatArray, other_cost: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the cheaper of two individuals each, and its cost."""
+    better = other_cost < cost
+    return np.where(better, other, x), np.where(better, other_cost, cost)
 
 
 def _at(x: FloatArray, index: np.ndarray) -> FloatArray:

@@ -128,10 +128,11 @@ def integrate(
     The noise of a sample acts at mid-rotation, where it is nearly isotropic.
     """
     batch = np.broadcast_shapes(readings.shape[:-2], steps.shape[:-1], bias.shape[:-1])
-    rotation = np.broadcast_to(np.eye(3), (*batch, 3, 3))
-    velocity = np.zeros((*batch, 3))
+    rotation: FloatArray = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+    velocity: FloatArray = np.zeros((*batch, 3))
     translation = velocity
-    J, N = np.zeros((*batch, 9, 6)), np.zeros((*batch, 9, 9))
+    J: FloatArray = np.zeros((*batch, 9, 6))
+    N: FloatArray = np.zeros((*batch, 9, 9))
     I3 = np.eye(3)
     for k in range(readings.shape[-2]):
         h = steps[..., k, None]

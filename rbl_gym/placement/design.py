@@ -63,7 +63,7 @@ def find_layout(
     found: dict[str, FloatArray] = {}
     for stage, kept in zip(STAGES, _KEPT, strict=True):
         setting = of_problem(problem, sample(problem, stage))
-        if stage == STAGES[0]:
+        if not found:
             found = _starts(problem, setting, rng, count, starts or {})
         improved = {name: _improved(setting, layout, rng) for name, layout in found.items()}
         names = sorted(improved, key=lambda name: improved[name][1])[:kept]
