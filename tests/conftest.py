@@ -43,6 +43,22 @@ def pytest_collection_modifyitems(config, items):
     items[:] = [item for item in items if item in kept]
 
 
+@pytest.fixture(scope="module")
+def coarse_design():
+    """Layouts of `place` with few candidates and positions: tests of how, not of how well."""
+    coarse = {
+        "rbl_gym.placement.design": {"STAGES": (64, 64, 64), "_CANDIDATES": 120, "_STARTS": 2},
+        "rbl_gym.studies.placing.accuracy": {"_MAP": 12, "_LEAST_MAP": 8},
+        "rbl_gym.studies.placing.judging": {"PLACES": 120, "MOST_PLACES": 480},
+        "rbl_gym.studies.placing.choosing": {"_PLACES": 120, "_LEAST_PLACES": 60},
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for module, values in coarse.items():
+            for name, value in values.items():
+                patch.setattr(f"{module}.{name}", value)
+        yield
+
+
 @pytest.fixture
 def no_search_for_causes(monkeypatch):
     """A replay that contradicts its filter does not look for the fault, which takes seconds."""

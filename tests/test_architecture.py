@@ -5,10 +5,14 @@ from __future__ import annotations
 import ast
 import functools
 import graphlib
+import importlib
+import json
+import sys
 import tomllib
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -69,11 +73,6 @@ def modules_of(package: str) -> list[str]:
 
 def pyproject() -> dict:
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-
-
-def test_importing_the_estimators_imports_every_module_that_may_register_a_filter():
-    lines = run_python("import sys, rbl_gym.estimators\nprint(*sys.modules, sep='\\n')")
-    assert set(modules_of("rbl_gym.estimators")) <= set(lines)
 
 
 # --- packages ---------------------------------------------------------------------------------
@@ -190,53 +189,80 @@ BEYOND = {
 
 
 @needs("cmaes", "plotly")
-def test_every_module_imports_alone_and_none_under_a_second_name():
+def test_every_module_imports_and_none_under_a_second_name():
     absent = {name for name, needs in BEYOND.items() if find_spec(needs) is None} | {
         name for name in MODULES if name.endswith("__main__")
     }
-    lines = run_python(f"""
-import importlib, sys
-for name in {sorted(set(MODULES) - absent)}:
-    importlib.import_module(name)
-second = [m for m in sys.modules if m.split(".")[0] in ("estimators", "wrappers")]
-print(second)
-""")
-    assert lines == ["[]"]
+    for name in sorted(set(MODULES) - absent):
+        importlib.import_module(name)
+    assert not {"estimators", "wrappers"} & set(sys.modules)
 
 
 # --- what an import costs ---------------------------------------------------------------------
 
 
-def test_import_is_light():
-    heavy = ["matplotlib", "filterpy", "scipy.stats", "rich", "pandas", "torch", "numba"]
-    lines = run_python(f"""
-import sys, rbl_gym
-print([m for m in {heavy} if m in sys.modules])
-""")
-    assert lines == ["[]"]
+@pytest.fixture(scope="module")
+def fresh() -> dict[str, dict[str, Any]]:
+    """The modules of a new process and their files, after each of some steps.
 
-
-def test_environment_runs_without_the_estimators():
-    lines = run_python("""
-import sys, gymnasium
-env = gymnasium.make("rbl_gym:RBL/Tracking-v0")
+    It finds the checkout by its root alone.
+    """
+    (line,) = run_python("""
+import importlib.util, json, sys
+told = {}
+def tell(step):
+    told[step] = {name: getattr(m, "__file__", None) for name, m in sys.modules.items()}
+import rbl_gym
+tell("import")
+import gymnasium
+env = gymnasium.make("rbl_gym:RBL/Tracking-v0", render_mode="rgb_array")
 env.reset(seed=0)
 env.step(0)
-ours = ("estimators", "wrappers", "studies", "app")
-heavy = (*(f"rbl_gym.{name}" for name in ours), "filterpy", "matplotlib")
-print([m for m in heavy if m in sys.modules])
+tell("step")
+env.render()
+tell("frame")
+import rbl_gym.estimators
+tell("estimators")
+import rbl_gym.wrappers, rbl_gym.app
+tell("all")
+folders = ("rbl_gym", "tests", "benchmarks", "examples", "docs")
+told["found"] = {name: str(importlib.util.find_spec("rbl_gym." + name)) for name in folders}
+print(json.dumps(told))
 """)
-    assert lines == ["[]"]
+    return json.loads(line)
 
 
-def test_checkout_imports_from_its_root_without_installation():
-    lines = run_python("""
-import rbl_gym, rbl_gym.estimators, rbl_gym.wrappers, rbl_gym.app
-for module in (rbl_gym, rbl_gym.estimators, rbl_gym.wrappers, rbl_gym.app):
-    print(module.__file__)
-""")
-    folders = ["rbl_gym", "estimators", "wrappers", "rbl_gym/app"]
-    assert lines == [str(ROOT / folder / "__init__.py") for folder in folders]
+def test_import_is_light(fresh):
+    heavy = {"matplotlib", "filterpy", "scipy.stats", "rich", "pandas", "torch", "numba"}
+    assert not heavy & set(fresh["import"])
+
+
+def test_environment_runs_without_the_estimators(fresh):
+    assert "rbl_gym.envs.tracking" in fresh["step"]
+    heavy = {*(f"rbl_gym.{name}" for name in ABOVE), "filterpy", "matplotlib"}
+    assert not heavy & set(fresh["step"])
+
+
+def test_a_frame_needs_matplotlib_without_pyplot(fresh):
+    assert "matplotlib" in fresh["frame"]
+    assert "matplotlib.pyplot" not in fresh["frame"]
+
+
+def test_importing_the_estimators_imports_every_module_that_may_register_a_filter(fresh):
+    assert set(modules_of("rbl_gym.estimators")) <= set(fresh["estimators"])
+
+
+def test_checkout_imports_from_its_root_without_installation(fresh):
+    folders = {**FOLDERS, "rbl_gym/app": "rbl_gym.app"}
+    for folder, name in folders.items():
+        assert fresh["all"][name] == str(ROOT / folder / "__init__.py")
+    doa = fresh["all"]["rbl_gym.estimators.locating.doa"]
+    assert doa == str(ROOT / "estimators" / "locating" / "doa.py")
+    assert not {"estimators", "wrappers"} & set(fresh["all"])
+
+
+def test_a_checkouts_other_folders_are_no_part_of_the_package(fresh):
+    assert set(fresh["found"].values()) == {"None"}
 
 
 # --- what stands where ------------------------------------------------------------------------

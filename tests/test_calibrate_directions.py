@@ -98,7 +98,7 @@ def test_cross_validation_takes_the_simplest_that_serves():
             0,
         ),
     ):
-        ranges, rotation, place = agents(rng, 30, model)
+        ranges, rotation, place = agents(rng, 18, model)
         told = (ranges > 0, RING, RING, rotation, place)
         best, errors = choose_basis(ranges, *told, candidates, LEVEL, parts=3)
         assert best == DirectionBasis(want)

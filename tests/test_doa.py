@@ -23,21 +23,21 @@ METHODS = ["ml", "nia", "pso", "psa"]
 degrees = pytest.mark.parametrize("sigma_deg", [0.01, 0.1, 1.0])
 
 
-def trials(count, sigma_deg, seed=0, turned=True, tags=TAGS, scale=1.0):
+def trials(count, sigma_deg, seed=0, turned=True, tags=TAGS):
     """Rotations and noisy angles at (5, 5, 3), the law of the noise."""
     rng = np.random.default_rng(seed)
     rotation = rotations.random(rng, (count,)) if turned else np.tile(np.eye(3), (count, 1, 1))
     noise = bearing.AngleNoise(np.deg2rad(max(sigma_deg, 1e-4)))
-    true = bearing.angles(ranging.tag_positions(rotation, scale * T, scale * tags))
+    true = bearing.angles(ranging.tag_positions(rotation, T, tags))
     normals = rng.standard_normal(true.shape)
     angles = noise.sample(true, normals) if sigma_deg > 0 else true
     return rotation, angles, noise
 
 
-def ratios(found, rotation, noise, scale=1.0):
+def ratios(found, rotation, noise):
     """RMSE over the bound of rotation and translation."""
-    error = metrics.pose_error(found.rotation, found.translation, rotation, scale * T)
-    P = doa_bounds.doa_crb(scale * TAGS, rotation, scale * T, noise)
+    error = metrics.pose_error(found.rotation, found.translation, rotation, T)
+    P = doa_bounds.doa_crb(TAGS, rotation, T, noise)
     variance = np.diagonal(P, axis1=-2, axis2=-1)
     return [
         np.sqrt((error[:, block] ** 2).sum(-1).mean() / variance[:, block].sum(-1).mean())
@@ -100,8 +100,9 @@ def test_reaches_the_bound_in_metres_and_in_kilometres(sigma_deg, method):
     found = estimators.locate_doa(angles, TAGS, method, noise, "y>0")
     in_metres = ratios(found, rotation, noise)
     np.testing.assert_allclose(in_metres, 1.0, atol=0.05)
-    small = estimators.locate_doa(angles, 1e-3 * TAGS, method, noise, "y>0")
-    np.testing.assert_allclose(ratios(small, rotation, noise, 1e-3), in_metres, atol=1e-3)
+    small = estimators.locate_doa(angles[:200], 1e-3 * TAGS, method, noise, "y>0")
+    np.testing.assert_allclose(small.translation, 1e-3 * found.translation[:200], atol=1e-6)
+    np.testing.assert_allclose(small.rotation, found.rotation[:200], atol=1e-4)
 
 
 @pytest.mark.parametrize("method", ["ml", "nia"])
@@ -138,7 +139,7 @@ def test_newtons_iteration_that_runs_away_says_nothing(sigma_deg, half_space):
 @pytest.mark.parametrize("half_space", ["y>0", None])
 def test_finds_the_global_optimum_of_brute_force(sigma_deg, half_space):
     """Against 60 random starts and the truth: nothing cheaper is found in any trial."""
-    count = 100
+    count = 40
     rotation, angles, noise = trials(count, sigma_deg, seed=5)
     found = estimators.locate_doa(angles, TAGS, "ml", noise, half_space)
     rng = np.random.default_rng(6)
@@ -190,7 +191,7 @@ def test_the_handedness_of_the_body_tells_its_side_or_the_ambiguity_is_reported(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_other_side_is_the_mirror_image(method):
-    _, angles, noise = trials(20, 0.01, seed=3)
+    _, angles, noise = trials(8, 0.01, seed=3)
     # The same body seen in a mirror is a body with mirrored tags.
     here = estimators.locate_doa(angles, TAGS, method, noise, "y>0")
     there = estimators.locate_doa(angles, TAGS[:, [1, 0, 2]] * [1, -1, 1], method, noise, "y<0")
@@ -229,17 +230,17 @@ def test_angles_no_direction_has_are_handled(shift):
     """A body across y = 0 and noise: some cosines are infeasible."""
     rng = np.random.default_rng(7)
     place = np.array([8.0, 0.0, 3.0]) + shift
-    rotation = rotations.random(rng, (200,))
+    rotation = rotations.random(rng, (100,))
     noise = bearing.AngleNoise(np.deg2rad(1.0))
     angles = bearing.simulate(TAGS, rotation, place, noise, rng)
     if shift[1] > 0:
         assert ((np.cos(angles) ** 2).sum(axis=1) > 1).any()
     for method in METHODS:
-        found = estimators.locate_doa(angles[:50], TAGS, method, noise)
+        found = estimators.locate_doa(angles[:10], TAGS, method, noise)
         assert np.isfinite(found.cost).any()
     found = estimators.locate_doa(angles, TAGS, "ml", noise)
     cost = DoaCost(angles, np.full((2, 4), noise.std_rad**-2), TAGS, np.zeros(3))
-    near = minimize_pose(cost, rotation, np.tile(place, (200, 1)), 40).at.cost
+    near = minimize_pose(cost, rotation, np.tile(place, (100, 1)), 40).at.cost
     assert (found.cost <= near + 1e-6).mean() > 0.97
 
 

@@ -17,11 +17,9 @@ import rbl_gym
 from rbl_gym.app.cli import _parser
 from rbl_gym.estimators import filter as belief
 from rbl_gym.measurements import ranging
-from rbl_gym.placement import design
 from rbl_gym.studies.learning import policies
 from rbl_gym.studies.learning.deep_sets import DeepSets
 from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
-from rbl_gym.studies.placing import accuracy
 from rbl_gym.studies.replay import causes
 from tests.helpers import ROOT, needs
 
@@ -78,6 +76,7 @@ def train_a_little(block: str, page: str, names: dict[str, object]) -> None:
 
 
 @needs("cmaes")
+@pytest.mark.usefixtures("coarse_design")
 @pytest.mark.parametrize(
     "page",
     [page for page in PAGES if blocks(page, "python") and page.stem != OF_ITS_OWN],
@@ -99,8 +98,6 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
             for topic, time, message in test_bags.flight(types)
         ]
         test_bags.write_bag(tmp_path / "flight", "ros1", types, messages)
-    monkeypatch.setattr(design, "STAGES", (64, 64, 64))  # pages show how, not how well
-    monkeypatch.setattr(accuracy, "_MAP", 12)
     monkeypatch.setattr(causes, "_RANGES", 500)
     monkeypatch.setattr(causes, "_FEWEST", 20)
     write_files_that_pages_read(tmp_path)

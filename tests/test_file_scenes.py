@@ -200,7 +200,7 @@ def test_a_layout_gives_the_anchors(tmp_path):
 def test_files_are_members_of_families():
     family = [{"name": WAREHOUSE, "steps": 3, "n_anchors": {"integers": [3, 5]}}, "uwb_room"]
     env = gym.make("rbl_gym:RBL/Tracking-v0", scenes=family)
-    check_env(env.unwrapped)
+    check_env(env.unwrapped, skip_render_check=True)
     _, info = env.reset(seed=3)
     assert json.loads(info["scene"])["name"] in (WAREHOUSE, "uwb_room")
 
@@ -213,7 +213,7 @@ def test_walls_of_different_files_do_not_mix(floor):
     with pytest.raises(ValueError, match="scenes must have no walls"):
         gym.make("rbl_gym:RBL/AnchorPlacement-v0", scenes=[floor])
     family = [{"name": floor, "noise": {"floor_m": {"uniform": [0.02, 0.1]}}, "steps": 4}]
-    check_env(gym.make("rbl_gym:RBL/Tracking-v0", scenes=family).unwrapped)
+    check_env(gym.make("rbl_gym:RBL/Tracking-v0", scenes=family).unwrapped, skip_render_check=True)
 
 
 def test_a_file_that_changed_is_read_again(floor):
@@ -228,7 +228,7 @@ def test_a_file_that_changed_is_read_again(floor):
 @needs("shapely")
 def test_the_office_of_the_examples():
     env = gym.make("rbl_gym:RBL/Tracking-v0", scene=str(ROOT / "examples" / "office.toml"))
-    check_env(env.unwrapped)
+    check_env(env.unwrapped, skip_render_check=True)
     assert env.unwrapped.scene.n_anchors == 8  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -27,7 +27,7 @@ WRONG: list[Any] = [
 ]  # fmt: skip
 NO_NUMBERS = [float("nan"), float("inf"), float("-inf")]
 SIZES = [1e-320, 1e-300, 1e-200, 1e-12, 1e12, 1e160, 1e300, -1e300, 0.0, -1.0, *NO_NUMBERS]
-EXAMPLES = 8  # of each argument; docs/fuzzing.md says for how many it was run
+EXAMPLES = 4  # of each argument; docs/fuzzing.md says for how many it was run
 
 ARGUMENTS = [
     (name, argument)
@@ -85,7 +85,9 @@ def test_spoilt_arguments(name):
     call(function, arguments)
     for of, argument in ARGUMENTS:
         if of == name:
-            for form in forms(arguments[argument]):
+            # The methods of `locate` share its checks.
+            alike = "locate " in name and not name.endswith(" ml")
+            for form in forms(arguments[argument])[:: 4 if alike else 1]:
                 check(name, argument, form)
 
 

@@ -27,14 +27,14 @@ def rng(seed=1):
 
 @every_scene
 @every_layout
-@pytest.mark.parametrize("n_anchors", range(1, 10))
-def test_layouts_are_legal_whatever_the_scene_and_the_number(name, scene, n_anchors):
-    task, context = problem(scene, n_anchors, (3,))
-    anchors = layouts.layout(name, task, context, rng())
-    assert anchors.shape == (3, n_anchors, 3)
-    assert anchors.dtype == np.float64
-    assert placement.is_legal(task, anchors).all()
-    assert np.isfinite(placement.score(task, context, anchors)).all()
+def test_layouts_are_legal_whatever_the_scene_and_the_number(name, scene):
+    for n_anchors in (1, 2, 3, 5, 9):
+        task, context = problem(scene, n_anchors, (3,))
+        anchors = layouts.layout(name, task, context, rng())
+        assert anchors.shape == (3, n_anchors, 3)
+        assert anchors.dtype == np.float64
+        assert placement.is_legal(task, anchors).all()
+        assert np.isfinite(placement.score(task, context, anchors)).all()
 
 
 @every_scene

@@ -346,7 +346,7 @@ def test_the_clock_of_the_odometry_by_the_likelihood():
 
 @with_kernels
 def test_tuning_finds_the_noise_of_the_odometry():
-    log = a_log(K=40)
+    log = a_log(K=25)
     rough = SETTINGS.changed(odometry_m=0.5, odometry_deg=60.0, start=START)
     tuned = replay.tune(log, rough)
     assert {*tuned.found} >= {"range_std_m", "odometry_m", "odometry_deg", "constant_std_m"}

@@ -284,18 +284,13 @@ def test_an_ellipsoid_holds_95_percent_and_its_net_is_closed():
 # --- commands -----------------------------------------------------------------------------------
 
 
-def test_the_demo_writes_its_page(tmp_path, capsys):
-    path = tmp_path / "new" / "demo.html"
-    options = ["--trials", "3", "--plot", str(tmp_path / "demo.png"), "--html", str(path)]
-    assert main(["demo", *options]) == 0
-    assert f"page: {path}" in capsys.readouterr().out
-    assert "Plotly.newPlot" in path.read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize("with_truth", [True, False])
 def test_a_replay_writes_its_page(with_truth, files, tmp_path, capsys):  # noqa: F811
     path, figures = tmp_path / "track.html", tmp_path / "x.json"
     given = files if with_truth else {k: v for k, v in files.items() if k != "truth"}
+    for name in {"ranges", "truth"} & given.keys():
+        file = Path(given[name])
+        file.write_text("\n".join(file.read_text().splitlines()[:32]))
     options = ["--html", str(path), "--json", str(figures)]
     assert main([*arguments(given), *options]) == 0
     text = path.read_text(encoding="utf-8")

@@ -23,7 +23,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.placement import design, scene_files
+from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import (
     accuracy,
     choosing,
@@ -60,14 +60,7 @@ ROOM = {
 }  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def few_places(monkeypatch):
-    """How, not how finely: the numbers of places are small."""
-    monkeypatch.setattr(judging, "PLACES", 120)
-    monkeypatch.setattr(judging, "MOST_PLACES", 480)
-    monkeypatch.setattr(choosing, "_LEAST_PLACES", 60)
-    monkeypatch.setattr(choosing, "_PLACES", 120)
-    monkeypatch.setattr(design, "STAGES", (64, 64, 64))
+pytestmark = pytest.mark.usefixtures("coarse_design")
 
 
 def room(**zones_have):

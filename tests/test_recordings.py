@@ -357,7 +357,7 @@ def test_truth_at_errors(truth, times, gap, message):
         truth_at(truth, times, gap)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=25)
 @given(data=st.data())
 def test_order_does_not_matter_and_gaps_are_links(tmp_path_factory, data):
     """Rows of an epoch and columns permuted: the same recording; empty cells: no links."""

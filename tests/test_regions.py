@@ -152,7 +152,7 @@ def test_projection_is_nearer_than_every_drawn_point(kind):
     assert not worse.any(), f"{points[worse][0]} goes to {region.project(points)[worse][0]}"
 
 
-@settings(PROPERTY, max_examples=400)
+@settings(PROPERTY, max_examples=150)
 @given(st.tuples(st.floats(-2, 12), st.floats(-2, 10), st.floats(-12, 6)))
 def test_projection_onto_a_low_room_is_the_nearest_of_its_five_surfaces(point):
     (x0, y0, z0), (x1, y1, z1) = ROOM.bounds()

@@ -95,7 +95,7 @@ def test_laws_that_cannot_be_are_named(options):
 @with_kernels
 @pytest.mark.usefixtures("no_search_for_causes")
 def test_soft_knowledge_and_the_loss_for_late_ranges():
-    log = flight(TAGS)
+    log = flight(TAGS, count=30)
     log = log._replace(
         ranges=log.ranges + 2.0 * (np.random.default_rng(3).random(log.ranges.shape) < 0.1)
     )

@@ -396,14 +396,12 @@ def corners(scene: Scene) -> np.ndarray:
 )
 def test_no_range_needs_the_limit(name, trajectory):
     scene = change(name, trajectory=trajectory)
-    places = corners(scene)
-    # Ranges by hand take long.
-    episode = draw(scene, 0)
-    for k in range(0, scene.steps + 1, 50 if scene.obstacles else 25):
-        for m in range(scene.n_anchors):
+    places, episode = corners(scene), draw(scene, 0)
+    for k in range(0, scene.steps + 1, 25):
+        epoch = simulation.epoch_of(episode, k)
+        for m in range(8):
             moved = np.roll(places, m, axis=0)[np.arange(scene.n_anchors) % 8]
-            free = ranges_by_hand(scene, episode, k, moved)
-            assert free.max() < scene.range_limit_m
+            assert simulation.measure_epoch(scene, epoch, moved).ranges.max() < scene.range_limit_m
 
 
 @pytest.mark.parametrize(

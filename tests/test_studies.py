@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rbl_gym.app.cli import main
-from rbl_gym.placement import design as search_design
 from rbl_gym.placement import scene_files
 from rbl_gym.studies import backends, monte_carlo, network, replay
 from rbl_gym.studies.bench import leaderboard, records, spec_files
@@ -34,17 +33,6 @@ def timeless(value):
     if isinstance(value, list):
         return [timeless(item) for item in value]
     return value
-
-
-def test_demo(capsys, tmp_path):
-    told = Told()
-    mine = camsap2013.tracking_experiment(4, 2, told)
-    assert told.done == told.announced == 120
-    theirs = printed(capsys, "demo", "--trials", "4", "--seed", "2", "--plot", f"{tmp_path}/x.png")
-    assert timeless(mine) == timeless(theirs)
-    assert {claim["statement"] for claim in mine["claims"]}
-    claim = camsap2013.Claim(**mine["claims"][0])
-    assert claim.source == "paper"
 
 
 def test_an_example_has_the_errors_of_its_beliefs():
@@ -139,8 +127,8 @@ def test_replay_in_one_call_is_the_four():
 
 
 @needs("cmaes")
-def test_place(capsys, monkeypatch):
-    monkeypatch.setattr(search_design, "STAGES", (64, 64, 64))
+@pytest.mark.usefixtures("coarse_design")
+def test_place(capsys):
     problem = scene_files.problem("uwb_room", 4, None, 0, 0)
     placed = answer.place_anchors(problem, answer.Question(range(4, 5), trials=20))
     arguments = "--scene", "uwb_room", "--anchors", "4", "--trials", "20"

@@ -62,7 +62,7 @@ def test_an_update_is_the_maximum_a_posteriori_of_pose_and_places():
     np.testing.assert_allclose(state.covariance, want, atol=0.05 * std.max() ** 2)
 
 
-@pytest.mark.parametrize("offset", [None, "tag"])
+@pytest.mark.parametrize("offset", [pytest.param(None, marks=pytest.mark.long), "tag"])
 def test_the_filter_that_knows_the_survey_is_at_its_bound(offset):
     """200 trials of 13 epochs: the ratio within 5 %, NEES/6 within 0.1 (2 and 3 deviations)."""
     changes = {"links": {"offset": offset}, "steps": 12, "survey_std_m": 0.1}

@@ -53,7 +53,7 @@ def test_the_likelier_filter_is_taken():
     biases = 0.15 * np.random.default_rng(6).standard_normal((7, 5))
     settings = SETTINGS.changed(bias_std_m=0.15, bias_time_s=None)
     for ranges, name in ((RANGES, "iekf"), (RANGES + biases, "iekf-bias")):
-        tuned = replay.tune(recording(ranges[:20]), settings, filters=("iekf", "iekf-bias"))
+        tuned = replay.tune(recording(ranges[:14]), settings, filters=("iekf", "iekf-bias"))
         assert tuned.found["filter"] == tuned.settings.filter == name
         assert tuned.options.startswith(f"--filter {name} --range-std-m ")
 
@@ -133,7 +133,7 @@ def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
                 "--filter",
                 "iekf",
                 "--tune-s",
-                "5",
+                "2",
                 "--json",
                 str(tmp_path / "tuned.json"),
             ]
@@ -143,7 +143,7 @@ def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
     tuned = json.loads((tmp_path / "tuned.json").read_text())
     options = tuned["tuned"]["options"].split()
     assert tuned["settings"]["walk_m"] == float(options[options.index("--walk-m") + 1])
-    assert tuned["tuned"]["epochs"] == 51
+    assert tuned["tuned"]["epochs"] == 21
     # The options repeated give the same run.
     assert cli.main([*arguments, *options, "--json", str(tmp_path / "again.json")]) == 0
     again = json.loads((tmp_path / "again.json").read_text())
