@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import multiprocessing
 import pickle
@@ -206,6 +207,7 @@ print(kernel.scaled.build()(1.0))
 # --- small matrices and rotations -------------------------------------------------------------
 
 
+@functools.cache
 def from_python(helper):
     """A helper of kernels, which has no entry of its own for Python, by a function that has one."""
     return importlib.import_module("numba").njit(lambda *args: helper(*args))
@@ -302,18 +304,19 @@ def test_rotations_equal_scipy_and_the_textbook_forms():
     exp, log = from_python(ours.exp), from_python(ours.log)
     jacobian = from_python(ours.left_jacobian)
     jacobian_inverse = from_python(ours.left_jacobian_inverse)
-    out = np.empty((3, 3))
-    for w in rotation_vectors():
-        x, y, z = w.tolist()
-        exp(x, y, z, out)
-        np.testing.assert_allclose(out, Rotation.from_rotvec(w).as_matrix(), atol=1e-14)
-        back = np.array(log(out))
-        # At pi both ends of the axis are right.
-        if np.linalg.norm(w) > np.pi - 1e-7 and back @ w < 0:
-            back = -back
-        np.testing.assert_allclose(back, w, rtol=0, atol=3e-15 + 1e-15 * float(np.linalg.norm(w)))
-        jacobian(x, y, z, out)
-        np.testing.assert_allclose(out, rotations.left_jacobian(w), atol=1e-14)
-        inverse = np.empty((3, 3))
-        jacobian_inverse(x, y, z, inverse)
-        np.testing.assert_allclose(out @ inverse, np.eye(3), atol=1e-13)
+    vectors = rotation_vectors()
+    R, J, inverse = np.empty((3, len(vectors), 3, 3))
+    back = np.empty_like(vectors)
+    for k, (x, y, z) in enumerate(vectors.tolist()):
+        exp(x, y, z, R[k])
+        back[k] = log(R[k])
+        jacobian(x, y, z, J[k])
+        jacobian_inverse(x, y, z, inverse[k])
+    np.testing.assert_allclose(R, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-14)
+    # At pi both ends of the axis are right.
+    length = np.linalg.norm(vectors, axis=1)
+    other = (length > np.pi - 1e-7) & ((back * vectors).sum(axis=1) < 0)
+    back[other] *= -1
+    assert (np.abs(back - vectors).max(axis=1) <= 3e-15 + 1e-15 * length).all()
+    np.testing.assert_allclose(J, rotations.left_jacobian(vectors), atol=1e-14)
+    np.testing.assert_allclose(J @ inverse, np.tile(np.eye(3), (len(vectors), 1, 1)), atol=1e-13)

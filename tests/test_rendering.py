@@ -21,7 +21,6 @@ from rbl_gym.wrappers import (
     VectorEstimateNetwork,
     VectorEstimatePose,
 )
-from tests.helpers import run_python
 
 IDS = ("Tracking", "AnchorPlacement", "MobileAnchors", "AnchorSelection", "BaseStation",
        "PlanarNetwork")  # fmt: skip
@@ -83,15 +82,17 @@ def test_a_frame_is_an_image_of_its_own_memory_that_follows_the_episode(name):
     # Not empty: every quarter has something on its white.
     for part in (after[:270, :576], after[270:, :576], after[:270, 576:], after[270:, 576:]):
         assert 0.005 < (part.min(axis=-1) < 250).mean() < 0.7
+    again = make(name)
+    again.reset(seed=1)
+    np.testing.assert_array_equal(again.render(), before)
 
 
-@pytest.mark.parametrize("name", IDS)
-def test_the_same_episode_gives_the_same_pixels(name):
-    first = rolled(make(name))
+def test_the_same_episode_gives_the_same_pixels():
+    first = rolled(make("MobileAnchors"))
     # In between, another scene and other limits of the axes.
     rolled(make("Tracking", scene="hall"))
-    np.testing.assert_array_equal(first, rolled(make(name)))
-    assert (first != rolled(make(name), seed=5)).any()
+    np.testing.assert_array_equal(first, rolled(make("MobileAnchors")))
+    assert (first != rolled(make("MobileAnchors"), seed=5)).any()
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -367,16 +368,3 @@ def test_twenty_frames_a_second():
         seconds.append(time.process_time() - start)
     # All but the slowest tenth, which the collection of garbage or other processes may hit.
     assert np.mean(np.sort(seconds)[:36]) < 0.05
-
-
-def test_matplotlib_is_imported_by_the_first_frame_alone():
-    lines = run_python("""
-import sys, gymnasium, rbl_gym.rendering
-env = gymnasium.make("rbl_gym:RBL/Tracking-v0", render_mode="rgb_array")
-env.reset(seed=0)
-env.step(0)
-print("matplotlib" in sys.modules)
-env.render()
-print("matplotlib" in sys.modules, "matplotlib.pyplot" in sys.modules)
-""")
-    assert lines == ["False", "True False"]
