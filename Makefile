@@ -1,8 +1,10 @@
 # make demo: everything from nothing to a table, a picture and a page.  make test: the whole suite.
 PYTHON ?= python3
 BIN := .venv/bin
+# Of the checker of types: two need less time than one, but more of it in all.
+THREADS = 2
 
-.PHONY: demo test test-long coverage benchmarks lint format copy types docs dist clean
+.PHONY: demo test test-long coverage benchmarks lint format copy types docs wheel dist clean
 
 demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
@@ -40,19 +42,21 @@ copy: .venv/dev.stamp
 
 types: copy
 	cp -r tests pyproject.toml build/copy/
-	cd build/copy && ../../$(BIN)/pyright --threads 2 --pythonpath ../../$(BIN)/python
+	cd build/copy && ../../$(BIN)/pyright --threads $(THREADS) --pythonpath ../../$(BIN)/python
 
 # The site, in build/site; its reference is read from the copy.
 docs: copy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# The wheel, built from the sdist and installed outside the checkout, where the folder mapping has
-# to hold by itself. After the copy: both build in the checkout.
-dist: copy
-	rm -rf build/lib build/bdist* dist .venv/smoke
+# The wheel, built from the sdist. After the copy: both build in the checkout.
+wheel: copy
+	rm -rf build/lib build/bdist* dist
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/twine check --strict dist/*
-	$(BIN)/python -m venv .venv/smoke
+
+# The wheel installed outside the checkout, where the folder mapping has to hold by itself.
+dist: wheel
+	$(BIN)/python -m venv --clear .venv/smoke
 	.venv/smoke/bin/python -m pip install --quiet "$$(ls dist/*.whl)"
 	cd "$${TMPDIR:-/tmp}" && "$(CURDIR)/.venv/smoke/bin/python" -W error "$(CURDIR)/tests/smoke.py"
 
