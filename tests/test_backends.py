@@ -40,10 +40,10 @@ def same(folder: Path, name: str, other: str = "serial") -> bool:
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A real dask cluster, whose worker is a process of its own."""
+    """A real dask cluster with two workers, processes of their own."""
     distributed = pytest.importorskip("distributed", reason="needs the extra parallel")
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
         yield cluster
 
@@ -72,7 +72,7 @@ def test_two_processes_give_the_bytes_of_one_even_if_one_dies(folder, killer):
     assert main(["rerun", str(folder / "killed.jsonl"), "--jobs", "2"]) == 0
 
 
-def test_a_dask_worker_gives_the_same_bytes_even_if_one_dies(folder, cluster, killer):
+def test_two_dask_workers_give_the_bytes_of_one_even_if_one_dies(folder, cluster, killer):
     name, marker = killer
     options = ("--backend", "dask", "--address", cluster.scheduler_address)
     assert bench(folder, "killed-dask", *options, filters=f"kf,{name}") == 0
