@@ -300,6 +300,26 @@ def test_an_exchange_is_the_best_of_all():
     assert judged(found) < judged(points)
 
 
+def test_the_slope_of_the_dilution_is_that_of_finite_differences():
+    task, contexts = problem("drone_yard", 4, seed=2)
+    seen = scenery.of_task(task, contexts)
+    rng = np.random.default_rng(2)
+    points = task.scene.anchor_region.draw(rng.random((4, 3)))
+    weight, share = np.full(task.n_poses, 1 / task.n_poses), np.ones((task.n_poses, 4))
+    fixed = dilution.links_of(seen, points[:0], share[:, :0])
+    links = dilution.links_of(seen, points, share)
+    square, slope = dilution.square_and_slope(seen, weight, links, fixed, share)
+    assert square == pytest.approx(dilution_of(seen, weight, points, share), rel=1e-9)
+    for index in np.ndindex(4, 3):
+        moved = [points.copy(), points.copy()]
+        moved[0][index] += 1e-3
+        moved[1][index] -= 1e-3
+        high, low = (dilution_of(seen, weight, x, share) for x in moved)
+        assert slope[index] == pytest.approx(
+            (high - low) / 2e-3, rel=1e-4, abs=1e-6 * float(square)
+        )
+
+
 def test_exchanges_keep_to_what_is_allowed_and_stop():
     points, seen, judged, arguments = room_links(5, 7)
     allowed = np.arange(len(seen.candidates)) % 2 == 0

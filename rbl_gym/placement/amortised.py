@@ -1,8 +1,8 @@
 """Layouts from a network trained on many problems: one pass, without the score.
 
 In boxes, shells and rooms the network gives a position for each anchor, which the region projects
-to a legal one. On other mounts each anchor chooses among candidates. Where something is in the way,
-some anchors are then exchanged for candidates by `dilution`.
+to a legal one. On other mounts each anchor chooses among candidates. `dilution` improves the
+layout: in the open by steps, elsewhere by exchanges of anchors for candidates.
 `rbl_gym.studies.learning.amortised` trains the network.
 """
 
@@ -44,7 +44,8 @@ _FILE = "amortised.npz"
 _STEP_PLACES, _SPOTS = 256, 512
 # Where something is in the way: numbers of mirror images to compare, and of swaps after them.
 _IMAGES, _SWAPS = 2, 10
-# Largest numbers of exchanges by the dilution of precision.
+# Steps and largest numbers of exchanges by the dilution of precision.
+_STEPS = 5
 _EXCHANGES = {"walls": 2, "mounts": 12}
 # Contexts that are placed at once, with swaps and without.
 _AT_ONCE = {True: 16, False: 256}
@@ -86,6 +87,10 @@ class _Play(NamedTuple):
         Number of anchors to place.
     weight
         Weights (P,) of the places of `seen`.
+    region
+        Legal positions.
+    open
+        Whether nothing is in the way.
     """
 
     seen: Scenery
@@ -93,12 +98,14 @@ class _Play(NamedTuple):
     legal: Callable[[FloatArray], FloatArray]
     count: int
     weight: FloatArray
+    region: Region
+    open: bool
 
 
 def _placed(network: Network, play: _Play, image: int = 0) -> FloatArray:
     """Return anchors (..., M, 3) of one pass of the network, on one of the mirror images.
 
-    Among candidates they are exchanged by the dilution of precision.
+    The dilution of precision improves it: in the open by steps, among candidates by exchanges.
     """
     seen = turned(play.seen, image) if image else play.seen
     total = play.count + seen.fixed.shape[-2]
@@ -110,7 +117,25 @@ def _placed(network: Network, play: _Play, image: int = 0) -> FloatArray:
         _, unit = seen.frame()
         points = seen.aim()[..., None, :] + unit[..., None, None] * steps
         points = play.legal(turned_points(points, image, back=True))
-    return _exchanged(play, points) if seen.candidates.shape[-2] else points
+    if seen.candidates.shape[-2]:
+        return _exchanged(play, points)
+    return _stepped(play, points) if play.open else points
+
+
+def _stepped(play: _Play, points: FloatArray) -> FloatArray:
+    """Return anchors (..., M, 3) after steps along the gradient, without the score."""
+    seen, batch = play.seen, points.shape[:-2]
+    fixed = dilution.links_of(seen, seen.fixed, play.share(seen.fixed))
+
+    def evaluate(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        points = points.reshape(*batch, *points.shape[1:])
+        share = play.share(points)
+        links = dilution.links_of(seen, points, share)
+        square, slope = dilution.square_and_slope(seen, play.weight, links, fixed, share)
+        return square.reshape(-1), slope.reshape(-1, *slope.shape[-2:])
+
+    flat = points.reshape(-1, *points.shape[-2:])
+    return follow(evaluate, play.region, flat, _STEPS).reshape(points.shape)
 
 
 def _exchanged(play: _Play, points: FloatArray) -> FloatArray:
@@ -125,7 +150,7 @@ def _exchanged(play: _Play, points: FloatArray) -> FloatArray:
     )
     return dilution.exchanged(
         play.weight,
-        (2 / seen.extent) ** 2,
+        dilution.prior_of(seen),
         parts,
         ~_illegal(play, seen.candidates),
         _EXCHANGES[KINDS[seen.kind]],
@@ -172,8 +197,8 @@ def of_task(
 ) -> FloatArray:
     """Return layouts (..., M, 3) of a task in contexts (...).
 
-    With obstacles, or on mounts, some anchors are exchanged after the network by `dilution`,
-    without the score.
+    The layout of the network is improved by `dilution`, without the score: with steps in the open,
+    with exchanges of anchors behind obstacles and on mounts.
 
     Parameters
     ----------
@@ -218,10 +243,10 @@ def _of_contexts(
     def share(points: FloatArray) -> FloatArray:
         return obstacles.share(points, seen.places)
 
-    play, used = (
-        _Play(seen, share, legal, task.n_anchors, np.full(task.n_poses, 1 / task.n_poses)),
-        0,
-    )
+    weight = np.full(task.n_poses, 1 / task.n_poses)
+    is_open = not obstacles and not scene.obstruction
+    play = _Play(seen, share, legal, task.n_anchors, weight, scene.anchor_region, is_open)
+    used = 0
     if not evaluations:
         return _placed(network, play)
     poses = scenery.poses_of_task(task, seen, context)
@@ -286,7 +311,7 @@ def of_problem(
     def share(points: FloatArray) -> FloatArray:
         return problem.share(points, seen.places)
 
-    play, used = _Play(seen, share, legal, count, drawn.weight), 0
+    play, used = _Play(seen, share, legal, count, drawn.weight, problem.mounts, smooth), 0
     if swap:
         bound = swaps.bound_of(seen, scenery.poses_of_problem(problem, drawn))
         found, used = _swapped(network, play, bound, evaluations)

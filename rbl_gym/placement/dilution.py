@@ -1,8 +1,9 @@
-"""Exchange of anchors for candidates by the dilution of precision, without the score.
+"""Better layouts by the dilution of precision, without the score.
 
 The dilution of precision is the bound of the position error of a single point, without attitude.
-Adding an anchor changes its information by a matrix of rank one. Therefore all exchanges of one
-anchor are known at once, in closed form. Problems may have leading axes.
+It has a simple derivative. Adding an anchor changes its information by a matrix of rank one.
+Therefore all exchanges of one anchor for a candidate are known at once, in closed form. Problems
+may have leading axes.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.placement.tokens import Scenery
 
-__all__ = ["Links", "Parts", "exchanged", "links_of"]
+__all__ = ["Links", "Parts", "exchanged", "links_of", "prior_of", "square_and_slope"]
 
 # Upper halves of matrices of size 3: of the unit matrix, and how often each number appears.
 _UNIT = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
 _DOUBLED = 2 - _UNIT
+# Where the numbers of a matrix are in its upper half.
+_WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 # Anchors are at least this far from the body, as a fraction of the extent of the zones.
 _NEAR = 1e-6
 # Anchors that may be exchanged: those without which the layout is best.
@@ -53,11 +56,50 @@ class Parts(NamedTuple):
 def links_of(seen: Scenery, points: FloatArray, share: FloatArray) -> Links:
     """Return the links of anchors (..., M, 3) with information fractions (..., P, M)."""
     x, y, z = (seen.places[..., :, None, k] - points[..., None, :, k] for k in range(3))
-    square = np.maximum(x * x + y * y + z * z, (_NEAR * seen.extent[..., None, None]) ** 2)
-    floor, growth = (seen.noise[..., k, None, None] for k in (0, 1))
-    weight = seen.tags.shape[-2] * share / ((floor**2 + growth**2 * square) * square)
+    square = x * x + y * y + z * z
+    weight, _ = _weight(seen, square, share)
     wx, wy = weight * x, weight * y
     return Links(points, np.stack([wx * x, wx * y, wx * z, wy * y, wy * z, weight * z * z], -1))
+
+
+def _weight(seen: Scenery, square: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return w of the information w d d' of an offset, and its derivative by the square of d."""
+    square = np.maximum(square, (_NEAR * seen.extent[..., None, None]) ** 2)
+    floor, growth = (seen.noise[..., k, None, None] ** 2 for k in (0, 1))
+    variance = floor + growth * square
+    weight = seen.tags.shape[-2] * share / (variance * square)
+    return weight, -weight * (1 / square + growth / variance)
+
+
+def square_and_slope(
+    seen: Scenery, weight: FloatArray, anchors: Links, fixed: Links, share: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean square error (...), and its derivative (..., M, 3) by the anchors.
+
+    Parameters
+    ----------
+    seen, weight
+        The problem, and weights (P,) of its places.
+    anchors, fixed
+        Links of the layout, and of fixed anchors.
+    share
+        Information fractions (..., P, M) of the links of the layout, held constant.
+    """
+    total = anchors.told.sum(axis=-2) + fixed.told.sum(axis=-2)
+    P = _inverse(total + prior_of(seen)[..., None, None] * _UNIT)
+    away = seen.places[..., :, None, :] - anchors.points[..., None, :, :]
+    w, slope = _weight(seen, (away**2).sum(axis=-1), share)
+    # The trace of P falls by tr(PP dF), with F the sum of w d d'.
+    PPd = away @ _square(P)[..., _WHOLE]
+    along = (away * PPd).sum(axis=-1)
+    by_place = 2 * (w[..., None] * PPd + (slope * along)[..., None] * away)
+    square = (weight * _trace(P)).sum(axis=-1)
+    return square, (weight[:, None, None] * by_place).sum(axis=-3)
+
+
+def prior_of(seen: Scenery) -> FloatArray:
+    """Return the information (...) of each coordinate without anchors."""
+    return (2 / seen.extent) ** 2
 
 
 def exchanged(

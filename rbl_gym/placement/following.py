@@ -38,7 +38,7 @@ def follow(
     Parameters
     ----------
     evaluate
-        Returns scores (B,) and gradients (B, M, 3) of layouts.
+        Returns positive scores (B,) and gradients (B, M, 3) of layouts.
     region
         Legal positions; an anchor keeps its face.
     anchors
