@@ -122,7 +122,7 @@ def assert_contract(env_id: str, **arguments: Any) -> None:
     assert_same(twin.step(action), env.step(action))
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
         native = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, **arguments)
-        peer = peer_of(lambda: gym.make(env_id, **arguments).unwrapped, mode, 3, {})
+        peer = peer_of(lambda: gym.make(env_id, **arguments), mode, 3, {})
         assert_steps_alike(native, peer, 6, 3, {"rtol": 2e-5, "atol": 2e-5})
 
 

@@ -241,7 +241,7 @@ def test_network2009_takes_points_footprints_and_a_variance(small, tmp_path, cap
     assert main(arguments) == 2
     assert "must have the header x,y" in capsys.readouterr().err
     assert main(["reproduce", "doa2019", "--variance", "0.1"]) == 2
-    assert "doa2019 has no option variance" in capsys.readouterr().err
+    assert "doa2019 has no option --variance" in capsys.readouterr().err
 
 
 def test_kappa_grows_as_section_iv_e_says():

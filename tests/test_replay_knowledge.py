@@ -45,7 +45,7 @@ def test_one_tag_gives_a_place_and_says_so():
     assert found["centre_rmse_m"] == pytest.approx(found["position_rmse_m"])
     assert "axis_rmse_deg" not in found
     (note,) = [note for note in found["notes"] if "do not determine" in note]
-    assert note.startswith("Note: the ranges do not determine the rotation: standard deviation")
+    assert note.startswith("Note: the ranges do not determine the rotation (since the start)")
     assert found["settings"]["robust"] == "late"
 
 
