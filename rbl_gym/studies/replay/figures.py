@@ -205,7 +205,8 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
 
     gap_s, counts = settings.comparison.truth_gap_s, ~excluded_epochs(track.times, settings)
     step = slice(None, None, _stride(track.times, gap_s))
-    some = Track(*(a[step].copy() for a in track[:4]))
+    times, rotation, translation, covariance = (values[step].copy() for values in track[:4])
+    some = Track(times, rotation, translation, covariance)
 
     def at(late_s: float, turned: bool) -> Judged:
         rotation = truth.rotation if turned else None
