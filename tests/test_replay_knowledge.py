@@ -49,6 +49,18 @@ def test_one_tag_gives_a_place_and_says_so():
     assert found["settings"]["robust"] == "late"
 
 
+def test_an_origin_far_from_the_line_of_the_tags_is_a_warning():
+    """Half a metre around the unknown axis is no Gaussian error; level bodies have none of it."""
+    recording = record(np.array([[0.0, 0.4, 0.5], [0.0, -0.4, 0.5]]))
+    (note,) = [one for one in outcome(recording).figures["notes"] if "do not determine" in one]
+    assert note.startswith("WARNING: ")
+    assert "0.50 m away from the tags" in note
+    assert "--tilt-std-deg" in note
+    found = outcome(recording, tilt_std_deg=3.0).figures
+    assert not any("do not determine" in one for one in found["notes"])
+    assert found["position_rmse_m"] < 0.2
+
+
 def test_two_tags_give_their_line():
     tags = np.array([[0.0, 0.4, 0.1], [0.0, -0.4, 0.1]])
     result = outcome(record(tags))

@@ -83,7 +83,8 @@ def _way_out(result: dict[str, Any]) -> str:
     move = result["out_of_plane"]
     if move is None:
         return (
-            "No mount is far enough from the plane to remove the mirror image: allow mounts at "
+            "No exchange of one anchor makes the mirror image differ by 5 standard deviations at "
+            "95 % of the positions: move more than one out of the plane, or allow mounts at "
             "another height."
         )
     where = ", ".join(f"{move[key]:.3f}" for key in ("x_m", "y_m", "z_m"))

@@ -56,7 +56,7 @@ def check_units(
     # A single anchor, or anchors at one position, contain no information on the scale.
     scale = typical / layout if layout > 1e-6 and anchors_are == "stand" else 1.0
     if not 1 / _MAX_SCALE_RATIO <= scale <= _MAX_SCALE_RATIO:
-        hint = " (ranges in cm or mm? set their unit)" if scale > 1 else ""
+        hint = " (ranges in cm or mm? set --unit)" if scale > 1 else ""
         raise ValueError(
             f"{paths[0]}: units look inconsistent, the median range is {typical:.4g} m and "
             f"the anchors lie {layout:.4g} m from their centre{hint}"

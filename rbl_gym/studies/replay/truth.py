@@ -25,7 +25,7 @@ _AS_GOOD = 1.5
 # Fewest poses that determine a fault, and the tested time shifts (s).
 _FEWEST = 4
 _SHIFTS = np.linspace(-3.0, 3.0, 121)
-_SI = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
+_SI = ((1e-3, "milli", "ms"), (1e-6, "micro", "us"), (1e-9, "nano", "ns"))
 
 
 def matched(
@@ -100,12 +100,13 @@ def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
     if truth is not None and len(truth.times) > 1 and len(times) > 1:
         ratio = float(np.ptp(times) / np.ptp(truth.times))
         for name, value in (("ranges", ratio), ("truth", 1 / max(ratio, 1e-30))):
-            for scale, unit in _SI:
+            option = "--time-unit {}" if name == "ranges" else "--columns truth.t=NAME[{}]"
+            for scale, prefix, unit in _SI:
                 # Logs of the same run are about equally long.
                 if 0.2 < value * scale < 5:
                     yield (
-                        f"the stamps of the {name} look like {unit}: they span {value:.3g} times "
-                        "as long as the others"
+                        f"the stamps of the {name} look like {prefix}seconds: they span "
+                        f"{value:.4g} times as long as the others; set {option.format(unit)}"
                     )
                     return
     if step >= _LONG_STEP_S:
