@@ -115,7 +115,8 @@ def _contradictions(result: dict[str, Any]) -> list[str]:
         return []
     cause = " Probable cause: the mirror image behind the plane of the anchors."
     return [
-        f"The check does not confirm the prediction: {', '.join(parts)}; see the table 'checked by "
+        "The verdict is that of the prediction: of standard deviations, not of single errors. The "
+        f"check does not confirm the prediction: {', '.join(parts)}; see the table 'checked by "
         f"Monte Carlo'.{cause if any_lost and result['coplanar'] else ''}"
     ]
 

@@ -367,7 +367,7 @@ def _check_within(check: dict[str, Any]) -> Rows:
         if "within" in row
     ]
     headings = [
-        "filter", "zone", "bodies", "found", "errors within the limits", "predicted",
+        "filter", "zone", "bodies", "found", "single errors within the limits", "predicted",
         "position RMSE (m)", "predicted", "heading RMSE (deg)", "predicted",
     ]  # fmt: skip
     return Rows("checked in each zone: horizontal position, heading", headings, rows)
