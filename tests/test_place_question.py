@@ -382,7 +382,7 @@ def test_the_least_number_by_the_command(files, capsys):
     assert fewest["one_less"]["n_anchors"] == result["n_anchors"] - 1
     failing = [zone for zone in fewest["one_less"]["zones"] if zone["verdict"] != "pass"]
     assert failing
-    assert place_report.verdict(result).endswith("that passes.")
+    assert place_report.verdict(result).endswith(" passes.")
     assert main([*command, "--fewest"]) == 0
     assert "with one anchor fewer" in capsys.readouterr().out
 

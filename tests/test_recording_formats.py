@@ -231,6 +231,7 @@ def test_unknown_ids(tmp_path):
     text = many(20) + "1.9,E,1,2\n1.9,A,7,2\n"
     log = read(tmp_path, text)
     assert log.report.dropped == {"of an unknown anchor": 1, "of an unknown tag": 1}
+    assert "1 of an unknown anchor (E), 1 of an unknown tag (7)" in note_of(log, "left out")
     with pytest.raises(ValueError, match=r"line 22, column 'anchor': unknown anchor, .*, got 'E'"):
         read_as(tmp_path, text, strict=True)
 

@@ -64,8 +64,10 @@ def verdict(result: dict[str, Any]) -> str:
     less = fewest["one_less"]
     if less is None:
         return f"{text} This is the least number that was allowed."
-    why = "no choice of" if fewest["proved"] else "no layout was found of"
-    return f"{text} The least number: {why} {less['n_anchors']} that passes."
+    count = less["n_anchors"]
+    if fewest["proved"]:
+        return f"{text} The least number: no choice of {count} passes."
+    return f"{text} No layout of {count} that passes was found; another --seed may find one."
 
 
 def notes(result: dict[str, Any]) -> list[str]:

@@ -306,8 +306,20 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
             f"may be unusable{hint}. The first: {_first(measured, table, ids, refused)}"
         )
     if shown := {c: n for c, n in counts.items() if c not in ("", "empty", "marked as not valid")}:
-        causes = ", ".join(f"{n} {cause}" for cause, n in shown.items())
+        causes = ", ".join(
+            f"{n} {cause}{_unknown_ids(measured, table, cause)}" for cause, n in shown.items()
+        )
         said.note(table.path, f"{sum(shown.values())} of {total} ranges are left out: {causes}")
+
+
+def _unknown_ids(measured: Measured, table: Table, cause: str) -> str:
+    """Return the unknown anchors or tags in brackets; nothing for other causes."""
+    column = _CAUSES[cause][1]
+    column = "anchor_a" if column == "anchor" and "anchor_a" in table.columns else column
+    if "unknown" not in cause or column not in table.columns:
+        return ""
+    rows = measured.row[measured.cause == _NAMES.index(cause)]
+    return f" ({', '.join(sorted({table.columns[column][row] for row in rows})):.80})"
 
 
 def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str:
