@@ -319,7 +319,8 @@ def _unknown_ids(measured: Measured, table: Table, cause: str) -> str:
     if "unknown" not in cause or column not in table.columns:
         return ""
     rows = measured.row[measured.cause == _NAMES.index(cause)]
-    return f" ({', '.join(sorted({table.columns[column][row] for row in rows})):.80})"
+    names = sorted({str(table.columns[column][row]) for row in rows.tolist()})
+    return f" ({', '.join(names):.80})"
 
 
 def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str:
