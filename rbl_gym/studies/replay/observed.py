@@ -15,7 +15,6 @@ __all__ = ["Observed", "observed"]
 
 # A direction is known if its standard deviation is below this rotation (rad) or position (m).
 _KNOWN_RAD, _KNOWN_M = 0.5, 1.0
-_INCLUDED = "The covariance includes this."
 # Tags are collinear if the ratio of their squared thickness to squared length is below this.
 _THIN = 0.01
 
@@ -74,14 +73,14 @@ def known_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], l
             f"the rotation about the body's axis {_axis(found.turn_axes[-1, :, 2])}",
         )[int(found.turns[-1])]
         std = f"{spread.max():.0f} deg" if spread.max() < 180 else "above 180 deg"
-        note = _note(what, std, _since(found.turns, times))
         middle = recording.tags.mean(axis=0)
         if found.turns[-1] == 2:
             axis = found.turn_axes[-1, :, 2]
             middle = middle - (middle @ axis) * axis
         lever = float(np.linalg.norm(middle))
         # On a circle of this radius the errors of the origin are not Gaussian.
-        notes.append(note if lever <= found.place_std[-1].max() else _far_origin(note, lever))
+        far = lever > found.place_std[-1].max()
+        notes.append(_note(what, std, _since(found.turns, times), lever if far else None))
     if found.places[-1] < 3:
         spread = found.place_std[-1].max()
         notes.append(_note("the position", f"{spread:.3g} m", _since(found.places, times)))
@@ -105,19 +104,20 @@ def _axis(axis: FloatArray) -> str:
     return "(" + ", ".join(f"{x:.2f}" for x in axis + 0.0) + ")"
 
 
-def _note(what: str, std: str, since: float) -> str:
+def _note(what: str, std: str, since: float, lever_m: float | None = None) -> str:
+    """Return a note, a warning if the origin of the body is `lever_m` away from the tags."""
+    kind, end = "Note", "The covariance includes this."
+    if lever_m is not None:
+        kind, end = (
+            "WARNING",
+            (
+                f"The origin of the body is {lever_m:.2f} m away from the tags, so its position is "
+                "unknown by as much, and the covariance is too small. State what is known (--planar "
+                "with --height-m, or --tilt-std-deg), or give the tags relative to their centre."
+            ),
+        )
     when = "since the start" if since == 0 else f"since {since:.1f} s after the start"
     return (
-        f"Note: the ranges do not determine {what} ({when}): its standard deviation is {std} at "
-        f"the end. {_INCLUDED}"
-    )
-
-
-def _far_origin(note: str, lever_m: float) -> str:
-    """Return the warning in place of the note on the rotation, if the origin is off the tags."""
-    return note.replace("Note:", "WARNING:").replace(
-        _INCLUDED,
-        f"The origin of the body is {lever_m:.2f} m away from the tags, so its position is unknown "
-        "by as much, and the covariance is too small. State what is known (--planar with "
-        "--height-m, or --tilt-std-deg), or give the tags relative to their centre.",
+        f"{kind}: the ranges do not determine {what} ({when}): its standard deviation is {std} at "
+        f"the end. {end}"
     )
