@@ -108,13 +108,11 @@ def _note(what: str, std: str, since: float, lever_m: float | None = None) -> st
     """Return a note, a warning if the origin of the body is `lever_m` away from the tags."""
     kind, end = "Note", "The covariance includes this."
     if lever_m is not None:
-        kind, end = (
-            "WARNING",
-            (
-                f"The origin of the body is {lever_m:.2f} m away from the tags, so its position is "
-                "unknown by as much, and the covariance is too small. State what is known (--planar "
-                "with --height-m, or --tilt-std-deg), or give the tags relative to their centre."
-            ),
+        kind = "WARNING"
+        end = (
+            f"The origin of the body is {lever_m:.2f} m away from the tags, so its position is "
+            "unknown by as much, and the covariance is too small. State what is known (--planar "
+            "with --height-m, or --tilt-std-deg), or give the tags relative to their centre."
         )
     when = "since the start" if since == 0 else f"since {since:.1f} s after the start"
     return (
