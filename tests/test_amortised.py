@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from rbl_gym import placement
+from rbl_gym.checks import as_tuples
 from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import (
     amortised,
     attention,
+    building,
     dilution,
     following,
     layouts,
@@ -95,34 +97,36 @@ def test_a_building_in_feet_has_the_same_layout():
     faces = mounts.faces._replace(
         origin=FEET * mounts.faces.origin, extents=FEET * mounts.faces.extents
     )
-    feet = dataclasses.replace(
-        metres,
-        tags=FEET * metres.tags,
+    zones = tuple(
+        dataclasses.replace(
+            zone,
+            polygon=FEET * zone.polygon,
+            low_m=FEET * zone.low_m,
+            high_m=FEET * zone.high_m,
+        )
+        for zone in metres.zones
+    )
+    feet = building.Problem.of(
+        zones,
+        metres.n_anchors,
+        FEET * metres.fixed,
+        name="feet",
+        tags=as_tuples(FEET * metres.tags),
         noise=RangeNoise(FEET * metres.noise.floor_m, metres.noise.proportional),
-        obstacles=dataclasses.replace(
-            metres.obstacles,
-            boxes=FEET * metres.obstacles.boxes,
-            prisms=dataclasses.replace(
-                prisms,
-                corners=FEET * prisms.corners,
-                low_m=FEET * prisms.low_m,
-                high_m=FEET * prisms.high_m,
-            ),
+        obstacles=as_tuples(FEET * metres.obstacles.boxes),
+        prisms=dataclasses.replace(
+            prisms,
+            corners=FEET * prisms.corners,
+            low_m=FEET * prisms.low_m,
+            high_m=FEET * prisms.high_m,
         ),
-        mounts=dataclasses.replace(mounts, pieces=FEET * mounts.pieces, faces=faces),
-        zones=tuple(
-            dataclasses.replace(
-                zone,
-                polygon=FEET * zone.polygon,
-                low_m=FEET * zone.low_m,
-                high_m=FEET * zone.high_m,
-            )
-            for zone in metres.zones
-        ),
-        fixed=FEET * metres.fixed,
+        blocked_information=metres.scene.blocked_information,
+        anchor_region=dataclasses.replace(mounts, pieces=FEET * mounts.pieces, faces=faces),
         gain=dataclasses.replace(
             gain, max_range_m=FEET * gain.max_range_m, range_edge_m=FEET * gain.range_edge_m
         ),
+        initial_rotation_rad=0.1,
+        initial_translation_m=1.0,
     )
     found = amortised.of_problem(metres)
     np.testing.assert_allclose(amortised.of_problem(feet) / FEET, found, rtol=1e-8, atol=1e-8)
@@ -182,14 +186,14 @@ def room_state(n_anchors=6, batch=(2,)):
     """A room with two racks, layouts at random candidates, and their state."""
     task, contexts = problem("uwb_room", n_anchors, 2, batch, seed=8)
     seen = scenery.of_task(task, contexts, for_swaps=True)
-    bound = swaps.bound_of(seen, scenery.poses_of_task(task, seen, contexts))
-    rng, obstacles = np.random.default_rng(1), task.obstacles(contexts)
+    bound = swaps.bound_of(setting.of_task(task, contexts), seen.candidates)
+    rng = np.random.default_rng(1)
     number = seen.candidates.shape[-2]
     index = np.stack([rng.permutation(number)[:n_anchors] for _ in range(*batch)])
     points = np.take_along_axis(seen.candidates, index[..., None], axis=-2)
 
     def judged(layouts):
-        return swaps.evaluated(bound, layouts, obstacles.share(layouts, seen.places))
+        return swaps.evaluated(bound, layouts)
 
     return task, contexts, seen.candidates, judged, judged(points)
 
@@ -245,7 +249,7 @@ def test_no_more_evaluations_than_asked(monkeypatch, scene, racks, evaluations):
 
         return call
 
-    monkeypatch.setattr(amortised, "of_arrays", counted(amortised.of_arrays))
+    monkeypatch.setattr(setting, "of_arrays", counted(setting.of_arrays))
     monkeypatch.setattr(swaps, "evaluated", counted(swaps.evaluated))
     task, contexts = problem(scene, 5, racks)
     amortised.of_task(task, contexts, evaluations)
@@ -272,7 +276,7 @@ def dilution_of(seen, weight, points, share):
 def room_links(n_anchors, seed):
     """A room with two racks as the exchange sees it, and its parts."""
     task, contexts = problem("uwb_room", n_anchors, 2, seed=seed)
-    seen, obstacles = scenery.of_task(task, contexts), task.obstacles(contexts)
+    seen, obstacles = scenery.of_task(task, contexts), task.obstacles_in(contexts)
     rng = np.random.default_rng(seed)
     points = task.scene.anchor_region.draw(rng.random((n_anchors, 3)))
     everything = points, seen.fixed, seen.candidates

@@ -65,7 +65,8 @@ def test_the_office_is_read():
     assert problem.name == "office"
     assert problem.noise == RangeNoise(0.08, 0.004)
     assert problem.n_anchors == 8
-    assert problem.prior == building.Prior(math.radians(15), 0.5)
+    assert problem.scene.initial_rotation_rad == math.radians(15)
+    assert problem.scene.initial_translation_m == 0.5
     assert problem.plan is None
     np.testing.assert_array_equal(problem.fixed, [[23.8, 0.2, 2.6]])
     assert problem.gain.max_range_m == 30

@@ -97,12 +97,9 @@ def test_an_anchor_snaps_to_the_nearest_legal_mount(room):
 
 
 def test_an_anchor_goes_neither_into_an_obstacle_nor_onto_another(room):
-    blocked = dataclasses.replace(
-        room.world.base,
-        obstacles=dataclasses.replace(
-            room.world.base.obstacles, boxes=np.array([[0.0, 0, 3, 1, 1, 3]])
-        ),
-    )
+    base = room.world.base
+    scene = dataclasses.replace(base.scene, obstacles=[[0.0, 0, 3, 1, 1, 3]])
+    blocked = dataclasses.replace(base, scene=scene)
     start = open_state(blocked, room.anchors)
     assert move(start, 0, np.array([0.0, 0.0, 9.0])) is start
     assert move(room, 0, room.anchors[1]) is room

@@ -187,7 +187,7 @@ def follow(
     """
     scene, shape = task.scene, course.normals.shape[:-3]
     anchors = np.broadcast_to(anchors[..., None, :, :], (*shape, *anchors.shape[-2:]))
-    obstacles = task.obstacles(context._replace(racks=context.racks[..., None, :, :]))
+    obstacles = task.obstacles_in(context._replace(racks=context.racks[..., None, :, :]))
     covariance = wider**2 * scene.prior_covariance
     state = filter.initial(course.prior_rotation, course.prior_translation, covariance)
     for k in range(EPOCHS):

@@ -24,8 +24,7 @@ from rbl_gym.placement import dilution, scenery, setting, swaps
 from rbl_gym.placement.attention import MOST, chosen, forward
 from rbl_gym.placement.building import Problem, cube
 from rbl_gym.placement.following import follow
-from rbl_gym.placement.gradient import of_arrays
-from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.placement.problem import Context, PlacementTask, link_shares
 from rbl_gym.placement.sample import sample
 from rbl_gym.placement.tokens import (
     KINDS,
@@ -79,27 +78,29 @@ class _Play(NamedTuple):
     ----------
     seen
         Input of the network.
-    share
-        Returns the information fractions (..., P, M) of the links of anchors (..., M, 3).
-    legal
-        Returns legal positions (..., M, 3) for points of any kind.
-    count
-        Number of anchors to place.
-    weight
-        Weights (P,) of the places of `seen`.
-    region
-        Legal positions.
+    judge
+        The score at the places of `seen`.
+    held
+        Obstacles in which no anchor may be.
     open
         Whether nothing is in the way.
+    count
+        Number of anchors to place.
     """
 
     seen: Scenery
-    share: Callable[[FloatArray], FloatArray]
-    legal: Callable[[FloatArray], FloatArray]
-    count: int
-    weight: FloatArray
-    region: Region
+    judge: setting.Setting
+    held: Obstacles
     open: bool
+    count: int
+
+    def share(self, points: FloatArray) -> FloatArray:
+        """Return the information fractions (..., P, M) of the links of anchors (..., M, 3)."""
+        return link_shares(self.judge.scene, self.judge.obstacles, points, self.seen.places)
+
+    def legal(self, points: FloatArray) -> FloatArray:
+        """Return legal positions (..., M, 3) for points of any kind."""
+        return _legal(self.judge.region, self.held, points)
 
 
 def _placed(network: Network, play: _Play, image: int = 0) -> FloatArray:
@@ -131,11 +132,13 @@ def _stepped(play: _Play, points: FloatArray) -> FloatArray:
         points = points.reshape(*batch, *points.shape[1:])
         share = play.share(points)
         links = dilution.links_of(seen, points, share)
-        square, slope = dilution.square_and_slope(seen, play.weight, links, fixed, share)
+        square, slope = dilution.square_and_slope(
+            seen, play.judge.sample.weight, links, fixed, share
+        )
         return square.reshape(-1), slope.reshape(-1, *slope.shape[-2:])
 
     flat = points.reshape(-1, *points.shape[-2:])
-    return follow(evaluate, play.region, flat, _STEPS).reshape(points.shape)
+    return follow(evaluate, play.judge.region, flat, _STEPS).reshape(points.shape)
 
 
 def _exchanged(play: _Play, points: FloatArray) -> FloatArray:
@@ -149,7 +152,7 @@ def _exchanged(play: _Play, points: FloatArray) -> FloatArray:
         )
     )
     return dilution.exchanged(
-        play.weight,
+        play.judge.sample.weight,
         dilution.prior_of(seen),
         parts,
         ~_illegal(play, seen.candidates),
@@ -165,24 +168,18 @@ def _illegal(play: _Play, candidates: FloatArray) -> BoolArray:
     return away > 1e-6 * play.seen.frame()[1][..., None]
 
 
-def _swapped(
-    network: Network, play: _Play, bound: swaps.Bound, evaluations: int
-) -> tuple[FloatArray, int]:
+def _swapped(network: Network, play: _Play, evaluations: int) -> tuple[FloatArray, int]:
     """Return anchors (..., M, 3) after mirror images and swaps, and the number of evaluations."""
-    candidates = play.seen.candidates
-
-    def judged(points: FloatArray) -> swaps.State:
-        return swaps.evaluated(bound, points, play.share(points))
-
-    best, used = judged(_placed(network, play)), 1
+    candidates, bound = play.seen.candidates, swaps.bound_of(play.judge, play.seen.candidates)
+    best, used = swaps.evaluated(bound, _placed(network, play)), 1
     for image in range(1, min(_IMAGES, evaluations)):
-        best, _ = swaps.better(best, judged(_placed(network, play, image)))
+        best, _ = swaps.better(best, swaps.evaluated(bound, _placed(network, play, image)))
         used += 1
     illegal = _illegal(play, candidates)[..., None, :]
     tried = illegal | swaps.occupied(best.points, candidates)
     while used < min(_IMAGES + _SWAPS, evaluations) and (best.decrease > 0)[~tried].any():
         points, pair = swaps.swapped(best, candidates, tried)
-        best, is_new = swaps.better(best, judged(points))
+        best, is_new = swaps.better(best, swaps.evaluated(bound, points))
         fresh = illegal | swaps.occupied(best.points, candidates)
         tried = np.where(is_new[..., None, None], fresh, tried | pair)
         used += 1
@@ -222,7 +219,7 @@ def of_task(
     batch, network = context.centre.shape[:-1], network or load()
     number = math.prod(batch)
     flat = [field.reshape(number, *field.shape[len(batch) :]) for field in context]
-    swap = evaluations > 1 and bool(task.obstacles(context))
+    swap = evaluations > 1 and bool(task.obstacles_in(context))
     size, found = _AT_ONCE[swap], np.zeros((number, task.n_anchors, 3))
     for k in range(0, number, size):
         part = Context(*(field[k : k + size] for field in flat))
@@ -234,46 +231,35 @@ def _of_contexts(
     task: PlacementTask, context: Context, evaluations: int, network: Network, swap: bool
 ) -> FloatArray:
     """Return the layouts (C, M, 3) of contexts."""
-    scene, obstacles = task.scene, task.obstacles(context)
-    seen = scenery.of_task(task, context, swap)
-
-    def legal(points: FloatArray) -> FloatArray:
-        return _legal(scene.anchor_region, scene.obstruction, points)
-
-    def share(points: FloatArray) -> FloatArray:
-        return obstacles.share(points, seen.places)
-
-    weight = np.full(task.n_poses, 1 / task.n_poses)
-    is_open = not obstacles and not scene.obstruction
-    play = _Play(seen, share, legal, task.n_anchors, weight, scene.anchor_region, is_open)
-    used = 0
-    if not evaluations:
-        return _placed(network, play)
-    poses = scenery.poses_of_task(task, seen, context)
-    bound = swaps.bound_of(seen, poses)
-
-    def evaluate(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        links = share(points)[..., None]
-        return of_arrays(
-            points,
-            scene.anchor_region.normal(points) if scene.gain else 0 * points,
-            *(poses.rotation, seen.places, poses.weight, bound.prior, seen.tags, poses.law),
-            scene.gain.numbers,
-            np.broadcast_to(links, (*links.shape[:-1], len(seen.tags))),
-        )
+    judge, held = setting.of_task(task, context), task.scene.obstruction
+    seen, is_open = scenery.of_task(task, context, swap), not judge.obstacles and not held
 
     def free(points: FloatArray) -> BoolArray:
-        each = (task.obstacles(Context(*row)) for row in zip(*context, strict=True))
+        each = (task.obstacles_in(Context(*row)) for row in zip(*context, strict=True))
         return ~np.stack([one.contain(x) for one, x in zip(each, points, strict=True)])
 
-    if swap:
-        found, used = _swapped(network, play, bound, evaluations)
-    else:
-        found = _placed(network, play)
-    if evaluations > used:
-        left, checked = evaluations - used, free if obstacles else None
-        found = follow(evaluate, scene.anchor_region, found, left, checked)
-    return found
+    play = _Play(seen, judge, held, is_open, task.n_anchors)
+    return _improved(network, play, evaluations, swap, judge, free if judge.obstacles else None)
+
+
+def _improved(
+    network: Network,
+    play: _Play,
+    evaluations: int,
+    swap: bool,
+    judge: setting.Setting,
+    free: Callable[[FloatArray], BoolArray] | None,
+) -> FloatArray:
+    """Return layouts (..., M, 3) after swaps, then steps along the gradient of another `judge`.
+
+    `free` returns which anchors (C, M) of layouts have legal positions; None: all.
+    """
+    found, used = _swapped(network, play, evaluations) if swap else (_placed(network, play), 0)
+    if evaluations <= used:
+        return found
+    flat = found.reshape(-1, *found.shape[-2:])
+    left = evaluations - used
+    return follow(judge.score_and_gradient, judge.region, flat, left, free).reshape(found.shape)
 
 
 def of_problem(
@@ -298,34 +284,17 @@ def of_problem(
         return problem.fixed.copy()
     check_count("the number of anchors to place", count, least=1, most=MOST)
     evaluations = check_count("evaluations", evaluations, least=0)
-    drawn = sample(problem, scenery.PLACES)
     smooth = isinstance(problem.mounts, Box | Shell | Walls) and not problem.obstacles
     swap = evaluations > 1 and not smooth
-    seen, network = scenery.of_problem(problem, drawn, swap), network or load()
+    judge, later = (
+        setting.of_problem(problem, sample(problem, number))
+        for number in (scenery.PLACES, _STEP_PLACES)
+    )
+    seen = scenery.of_problem(problem, judge.sample, swap)
     if KINDS[seen.kind] == "mounts" and len(seen.candidates) < count:
         raise ValueError("anchors have no permitted place: obstacles cover all of them")
-
-    def legal(points: FloatArray) -> FloatArray:
-        return _legal(problem.mounts, problem.obstacles, points)
-
-    def share(points: FloatArray) -> FloatArray:
-        return problem.share(points, seen.places)
-
-    play, used = _Play(seen, share, legal, count, drawn.weight, problem.mounts, smooth), 0
-    if swap:
-        bound = swaps.bound_of(seen, scenery.poses_of_problem(problem, drawn))
-        found, used = _swapped(network, play, bound, evaluations)
-    else:
-        found = _placed(network, play)
-    if evaluations > used:
-        judged = setting.of_problem(problem, sample(problem, _STEP_PLACES))
-
-        def evaluate(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-            score, gradient = judged.score_and_gradient(points[0])
-            return np.array([score]), gradient[None]
-
-        left = evaluations - used
-        found = follow(evaluate, problem.mounts, found[None], left, judged.legal)[0]
+    play = _Play(seen, judge, problem.obstacles, smooth, count)
+    found = _improved(network or load(), play, evaluations, swap, later, later.legal)
     return np.concatenate([problem.fixed, found])
 
 

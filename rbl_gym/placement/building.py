@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
@@ -19,10 +20,10 @@ from rbl_gym.geometry.regions import Box, Region
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
-from rbl_gym.placement.problem import Context
+from rbl_gym.placement.problem import Context, PlacementTask, link_shares
 from rbl_gym.worlds.scene import Scene
 
-__all__ = ["ATTITUDES", "Plan", "Prior", "Problem", "Zone", "free_places"]
+__all__ = ["ATTITUDES", "Plan", "Problem", "Zone", "free_places"]
 
 # Possible attitudes of the body in a zone.
 ATTITUDES = ("free", "level", "heading")
@@ -93,13 +94,6 @@ class Zone:
         return not self.position_m is self.height_m is self.heading_deg is None
 
 
-class Prior(NamedTuple):
-    """Standard deviations of the pose known before the first range."""
-
-    rotation_rad: float
-    position_m: float
-
-
 class Plan(NamedTuple):
     """The drawing of a problem.
 
@@ -122,51 +116,106 @@ class Plan(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """A placement problem: number of anchors, mounts, obstacles and zones.
+class Problem(PlacementTask):
+    """The placement task of one building: its work region is that of its zones.
 
     Parameters
     ----------
-    name
-        Name of the problem.
-    tags
-        Tags (N, 3) in the body frame, metres.
-    noise
-        Noise law of the ranges.
-    obstacles
-        Obstacles, which reduce the information of links.
-    mounts
-        Region of legal anchor positions.
+    scene
+        Scene with the body, the noise, the obstacles, the mounts (`anchor_region`), the anchors'
+        reach and field of view, and the prior. Its volume is the box around all zones.
+    n_anchors
+        Total number of anchors, including `fixed`.
+    racks
+        0: the boxes are obstacles of the scene.
+    n_poses
+        Number of poses in the zones, for `layouts` and `criteria`.
     zones
         Zones in which the body works; at least one.
-    n_anchors
-        Total number of anchors.
     fixed
-        Fixed anchors (F, 3), metres; they count in `n_anchors`.
-    gain
-        Reach and field of view of an anchor.
-    prior
-        Knowledge of the pose before the first range.
+        Fixed anchors (F, 3), metres.
     plan
         The drawing of the building, or None.
     """
 
-    name: str
-    tags: FloatArray
-    noise: NoiseLaw
-    obstacles: Obstacles
-    mounts: Region
-    zones: tuple[Zone, ...]
-    n_anchors: int
-    fixed: FloatArray
-    gain: Gain
-    prior: Prior
+    n_poses: int = 64
+    zones: tuple[Zone, ...] = ()
+    fixed: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     plan: Plan | None = None
+
+    def __post_init__(self) -> None:
+        """Check nothing: `file_checks` does, and a drawing may show any scene."""
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether it is the same object, as zones have arrays."""
+        return self is other
+
+    __hash__ = object.__hash__
+
+    @classmethod
+    def of(
+        cls,
+        zones: tuple[Zone, ...],
+        n_anchors: int,
+        fixed: ArrayLike = (),
+        plan: Plan | None = None,
+        **scene: Any,
+    ) -> Problem:
+        """Return the problem of zones, and of the other fields of its scene."""
+        low, high = zip(*(zone.bounds() for zone in zones), strict=True)
+        volume = Box(tuple(np.min(low, axis=0).tolist()), tuple(np.max(high, axis=0).tolist()))
+        still: dict[str, Any] = {"process": ProcessNoise(), "dt": 1.0}
+        whole = Scene(volume=volume, n_anchors=n_anchors, **(still | scene))
+        fixed = np.array(fixed, float).reshape(-1, 3)
+        return cls(whole, n_anchors, zones=zones, fixed=fixed, plan=plan)
+
+    @property
+    def name(self) -> str:
+        """Name of the problem."""
+        return self.scene.name
+
+    @property
+    def tags(self) -> FloatArray:
+        """Tags (N, 3) in the body frame, metres."""
+        return self.scene.body
+
+    @property
+    def noise(self) -> NoiseLaw:
+        """Noise law of the ranges."""
+        return self.scene.noise
+
+    @property
+    def obstacles(self) -> Obstacles:
+        """Obstacles, which reduce the information of links."""
+        return self.scene.obstruction
+
+    @property
+    def mounts(self) -> Region:
+        """Region of legal anchor positions."""
+        return self.scene.anchor_region
+
+    @property
+    def gain(self) -> Gain:
+        """Reach and field of view of an anchor."""
+        return self.scene.gain
+
+    @functools.cached_property
+    def context(self) -> Context:
+        """The box around all zones, and the boxes that block sight."""
+        low, high = self.corners()
+        return Context(0.5 * (low + high), 0.5 * (high - low), self.obstacles.boxes)
+
+    @functools.cached_property
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """Rotations (P, 3, 3), and offsets (P, 3) spread evenly over the free space."""
+        # If fewer positions are free than needed, they are repeated.
+        places = np.resize(self.free_places(self.n_poses), (self.n_poses, 3))
+        centre, half, _ = self.context
+        return super().poses[0], (places - centre) / np.where(half > 0, half, 1.0)
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper corner (3,) of the bounding box of all zones."""
-        low, high = zip(*(zone.bounds() for zone in self.zones), strict=True)
-        return np.min(low, axis=0), np.max(high, axis=0)
+        return self.scene.volume.bounds()
 
     def free(self, points: FloatArray) -> BoolArray:
         """Return which points (..., 3) lie in a zone and outside of the obstacles."""
@@ -190,40 +239,7 @@ class Problem:
         It depends on the obstacles between them, and on the anchors' reach and field of view.
         Anchors (..., M, 3) and points (..., P, 3), metres.
         """
-        share = self.obstacles.share(anchors, points)
-        if not self.gain:
-            return share
-        offsets = points[..., :, None, :] - anchors[..., None, :, :]
-        normals = self.mounts.normal(anchors)[..., None, :, :]
-        return share * self.gain.share(offsets, normals)
-
-    @functools.cached_property
-    def scene(self) -> Scene:
-        """Return the problem as a scene: its volume is the box around all zones.
-
-        Prisms, reach and field of view are not included.
-        """
-        boxes = self.obstacles.boxes
-        return Scene(
-            name=self.name,
-            volume=Box(*(tuple(corner.tolist()) for corner in self.corners())),
-            anchor_region=self.mounts,
-            n_anchors=self.n_anchors,
-            tags=tuple(map(tuple, self.tags.tolist())),
-            noise=self.noise,
-            obstacles=tuple(map(tuple, boxes.tolist())),
-            blocked_information=self.obstacles.blocked_information,
-            process=ProcessNoise(),
-            dt=1.0,
-            initial_rotation_rad=self.prior.rotation_rad,
-            initial_translation_m=self.prior.position_m,
-        )
-
-    @functools.cached_property
-    def context(self) -> Context:
-        """Return the box around all zones, and the boxes, for `layouts` and `criteria`."""
-        low, high = self.corners()
-        return Context(0.5 * (low + high), 0.5 * (high - low), self.obstacles.boxes)
+        return link_shares(self.scene, self.obstacles, anchors, points)
 
     def with_anchors(self, n_anchors: int) -> Problem:
         """Return the same problem with another number of anchors."""

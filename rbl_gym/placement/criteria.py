@@ -88,7 +88,7 @@ def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray
     places = placement.positions(task, context)
     distance = ranging.distances(anchors[..., None, :, :], places[..., None, :])
     weight = 1 / task.scene.noise.squared_range_variance(np.maximum(distance, 1e-6))
-    if in_the_way := task.obstacles(context):
+    if in_the_way := task.obstacles_in(context):
         weight = weight * in_the_way.share(anchors, places)[..., None]
     mean = (weight * anchors[..., None, :, :]).sum(axis=-2) / weight.sum(axis=-2)
     return np.sqrt(weight) * (anchors[..., None, :, :] - mean[..., None, :])

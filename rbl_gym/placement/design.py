@@ -91,10 +91,7 @@ def _starts(
         if number:
             continue
         for name, start in given.items():
-            seen = setting
-            if len(start):
-                seen = setting._replace(sample=setting.sample._replace(prior=setting.told(start)))
-            added = choose(seen, parts, count - len(start))
+            added = choose(setting.with_fixed(start), parts, count - len(start))
             found[name] = np.concatenate([start, candidates[added]])
     return found
 

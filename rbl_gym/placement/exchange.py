@@ -101,8 +101,8 @@ def _promise(setting: Setting, information: FloatArray) -> FloatArray:
     """Return minus the derivative of the mean square by the information's upper halves (P x 21)."""
     sample = setting.sample
     P = np.linalg.inv(information)
-    J = bounds.tag_jacobian(sample.rotation, setting.tags)
-    S = np.einsum("pnia,pnib->pab", J, J) / len(setting.tags)
+    J = bounds.tag_jacobian(sample.rotation, setting.scene.body)
+    S = np.einsum("pnia,pnib->pab", J, J) / J.shape[-3]
     K = sample.weight[:, None, None] * (P @ S @ P)
     return (MULTIPLICITY * packed(K)).astype(np.float32).ravel()
 

@@ -52,7 +52,5 @@ def _read(path: str, changed_ns: int) -> Scene:
         found.scene,
         anchors=fixed if every else None,
         fixed=() if every else fixed,
-        prisms=found.obstacles.prisms,
-        gain=found.gain,
         **_MOTION,
     )

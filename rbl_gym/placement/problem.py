@@ -129,9 +129,12 @@ class PlacementTask:
         """Information fraction of a link without line of sight, from the scene."""
         return self.scene.blocked_information
 
-    def obstacles(self, context: Context) -> Obstacles:
+    def obstacles_in(self, context: Context) -> Obstacles:
         """Return the obstacles of a context."""
-        return Obstacles(context.racks, self.scene.blocked_information, self.scene.prisms)
+        own = self.scene.obstruction
+        if context.racks is own.boxes:
+            return own  # with its grid
+        return Obstacles(context.racks, own.blocked_information, own.prisms)
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
@@ -240,7 +243,7 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
     does not include the scene's fixed anchors.
     """
     places = positions(task, context)
-    share = _share(task, context, anchors, places)[..., None]
+    share = link_shares(task.scene, task.obstacles_in(context), anchors, places)[..., None]
     return bounds.information_at(
         anchors[..., None, :, :], task.scene.body, task.poses[0], places, task.scene.noise, share
     )
@@ -255,17 +258,21 @@ def information_of_fixed(task: PlacementTask, context: Context) -> FloatArray:
     return information(task, context, fixed)
 
 
-def _share(
-    task: PlacementTask, context: Context, anchors: FloatArray, places: FloatArray
+def link_shares(
+    scene: Scene, in_the_way: Obstacles, anchors: FloatArray, places: FloatArray
 ) -> FloatArray:
-    """Return the information fraction (..., P, M) for each anchor's sight of each position."""
-    in_the_way, gain = task.obstacles(context), task.scene.gain
+    """Return the information fraction (..., P, M) of links from each anchor to each position.
+
+    It depends on the obstacles between them, and on the anchors' reach and field of view.
+    """
+    gain = scene.gain
     if not in_the_way and not gain:
-        return np.ones((task.n_poses, anchors.shape[-2]))
+        batch = np.broadcast_shapes(anchors.shape[:-2], places.shape[:-2])
+        return np.broadcast_to(1.0, (*batch, places.shape[-2], anchors.shape[-2]))
     share = in_the_way.share(anchors, places)
     if not gain:
         return share
-    normals = task.scene.anchor_region.normal(anchors)[..., None, :, :]
+    normals = scene.anchor_region.normal(anchors)[..., None, :, :]
     return share * gain.share(places[..., None, :] - anchors[..., None, :, :], normals)
 
 
@@ -291,7 +298,7 @@ def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tup
         fixed = np.broadcast_to(task.scene.fixed, (*anchors.shape[:-2], len(task.scene.fixed), 3))
         anchors = np.concatenate([fixed, anchors], axis=-2)
     places = positions(task, context)
-    share = _share(task, context, anchors, places)
+    share = link_shares(task.scene, task.obstacles_in(context), anchors, places)
     law = ranging.numbers_of(task.scene.noise, len(task.scene.tags))
     assert law is not None  # the laws of scenes have numbers
     return anchors, task.poses[0], places, task.scene.body, task.prior_information, law, share
@@ -380,7 +387,7 @@ def mounts(task: PlacementTask) -> FloatArray:
 
 def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """Return the fraction (..., M) of the task's poses that each anchor sees."""
-    in_the_way = task.obstacles(context)
+    in_the_way = task.obstacles_in(context)
     if not in_the_way:
         return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
     return in_the_way.sees(anchors, positions(task, context)).mean(axis=-2)

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import placement
-from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, as_tuples, check_array, check_number
 from rbl_gym.geometry.obstacles import Obstacles, Prisms, inside
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import NOISE_LAWS, NoiseLaw
-from rbl_gym.placement.building import Plan, Prior, Problem, Zone
+from rbl_gym.placement.building import Plan, Problem, Zone
 from rbl_gym.placement.file_checks import check_numbers, check_problem
 from rbl_gym.placement.file_keys import BODIES, FORMAT, MAX_ANCHORS, MIN_ANCHORS
 from rbl_gym.placement.file_lines import line_of
@@ -35,6 +35,11 @@ __all__ = ["Problem", "inside", "load", "of_mapping", "problem", "with_anchors"]
 
 _REGIONS = {"room": Walls, "box": Box, "shell": Shell}
 _REQUIREMENTS = ("position_m", "height_m", "heading_deg")
+# Fields of a named scene that its problem has.
+_SHARED = (
+    "name", "tags", "noise", "anchor_region", "blocked_information", "initial_rotation_rad",
+    "initial_translation_m",
+)  # fmt: skip
 
 
 def problem(
@@ -85,17 +90,11 @@ def problem(
         context = placement.draw_contexts(task, np.random.default_rng([seed, racks]))
     low, high = known.volume.bounds() if region is None else _corners("region", region)
     return check_problem(
-        Problem(
-            name=known.name,
-            tags=known.body,
-            noise=known.noise,
-            obstacles=Obstacles(context.racks, known.blocked_information),
-            mounts=known.anchor_region,
-            zones=(_box_zone("region", low, high),),
-            n_anchors=check_n_anchors(task.n_anchors),
-            fixed=np.empty((0, 3)),
-            gain=Gain(),
-            prior=Prior(known.initial_rotation_rad, known.initial_translation_m),
+        Problem.of(
+            (_box_zone("region", low, high),),
+            check_n_anchors(task.n_anchors),
+            obstacles=as_tuples(context.racks),
+            **{key: getattr(known, key) for key in _SHARED},
         )
     )
 
@@ -150,18 +149,21 @@ def of_mapping(
     else:
         zones = _zones(lists["zones"])
     return check_problem(
-        Problem(
+        Problem.of(
+            zones,
+            check_n_anchors(number),
+            anchors["fixed"],
+            _plan(tables, Path(folder)),
             name=check_text("name", tables.get("name", name)),
-            tags=_tags(tables["body"]),
+            tags=as_tuples(_tags(tables["body"])),
             noise=noise,
-            obstacles=obstacles,
-            mounts=_mounts(anchors, lists, obstacles, walls),
-            zones=zones,
-            n_anchors=check_n_anchors(number),
-            fixed=anchors["fixed"],
+            obstacles=as_tuples(obstacles.boxes),
+            prisms=obstacles.prisms,
+            blocked_information=blocked,
+            anchor_region=_mounts(anchors, lists, obstacles, walls),
             gain=_gain(anchors),
-            prior=Prior(math.radians(prior["rotation_deg"]), prior["position_m"]),
-            plan=_plan(tables, Path(folder)),
+            initial_rotation_rad=math.radians(prior["rotation_deg"]),
+            initial_translation_m=prior["position_m"],
         )
     )
 

@@ -12,11 +12,9 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements import ranging
-from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import ATTITUDES, Problem, cube
-from rbl_gym.placement.problem import Context, PlacementTask, positions
+from rbl_gym.placement.problem import Context, PlacementTask, link_shares, positions
 from rbl_gym.placement.sample import Sample
-from rbl_gym.placement.swaps import Poses
 from rbl_gym.placement.tokens import KINDS, Scenery
 
 __all__ = ["of_problem", "of_task"]
@@ -31,45 +29,13 @@ _KINDS = {Box: "box", Shell: "shell", Walls: "walls"}
 
 def of_task(task: PlacementTask, context: Context, for_swaps: bool = False) -> Scenery:
     """Return the scenery of a task in contexts (...); swaps need more candidates."""
-    scene = task.scene
     batch = context.centre.shape[:-1]
-    fixed = np.array(scene.fixed).reshape(-1, 3)
     zone = np.concatenate([context.centre, context.half, np.zeros((*batch, 4))], axis=-1)
     zone[..., 6:8] = 1.0
-    left = np.broadcast_to(scene.blocked_information, (*context.racks.shape[:-1], 1))
-    extent = float(np.ptp(scene.volume.bounds(), axis=0).max())
-    return _scenery(
-        scene.anchor_region,
-        task.obstacles(context),
-        np.concatenate([context.racks, left], axis=-1),
-        Gain(),
-        for_swaps,
-        zones=zone[..., None, :],
-        fixed=np.broadcast_to(fixed, (*batch, *fixed.shape)),
-        tags=scene.body,
-        noise=_noise(scene.noise, len(scene.tags)),
-        extent=np.full(batch, extent),
-        even=False,
-        places=positions(task, context),
-    )
-
-
-def poses_of_task(task: PlacementTask, seen: Scenery, context: Context) -> Poses:
-    """Return the poses of the scenery of a task."""
-    return Poses(
-        task.poses[0],
-        np.full(task.n_poses, 1 / task.n_poses),
-        np.broadcast_to(task.prior_information, (task.n_poses, 6, 6)),
-        task.obstacles(context).share(seen.fixed, seen.places),
-        _law(task.scene.noise, len(task.scene.tags)),
-    )
-
-
-def poses_of_problem(problem: Problem, drawn: Sample) -> Poses:
-    """Return the poses of the scenery of a building."""
-    share = problem.share(problem.fixed, drawn.places)
-    law = _law(problem.noise, len(problem.tags))
-    return Poses(drawn.rotation, drawn.weight, drawn.prior, share, law)
+    fixed = np.array(task.scene.fixed).reshape(-1, 3)
+    fixed = np.broadcast_to(fixed, (*batch, *fixed.shape))
+    places, rows = positions(task, context), zone[..., None, :]
+    return _scenery(task, context, places, for_swaps, zones=rows, fixed=fixed, even=False)
 
 
 def of_problem(problem: Problem, drawn: Sample, for_swaps: bool = False) -> Scenery:
@@ -79,58 +45,28 @@ def of_problem(problem: Problem, drawn: Sample, for_swaps: bool = False) -> Scen
         low, high = zone.bounds()
         attitude = [float(zone.attitude == name) for name in ATTITUDES]
         rows.append([*0.5 * (low + high), *0.5 * (high - low), zone.weight, *attitude])
-    low, high = problem.corners()
-    return _scenery(
-        problem.mounts,
-        problem.obstacles,
-        _rows_of(problem.obstacles),
-        problem.gain,
-        for_swaps,
-        zones=np.array(rows),
-        fixed=problem.fixed,
-        tags=problem.tags,
-        noise=_noise(problem.noise, len(problem.tags)),
-        extent=np.asarray(np.ptp([low, high], axis=0).max()),
-        even=True,
-        places=drawn.places,
-    )
-
-
-def _law(noise: ranging.NoiseLaw, n_tags: int) -> FloatArray:
-    numbers = ranging.numbers_of(noise, n_tags)
-    assert numbers is not None  # the laws of scenes have numbers
-    return numbers
-
-
-def _noise(noise: ranging.NoiseLaw, n_tags: int) -> FloatArray:
-    """Return standard deviation at the anchor and growth (2,); squared ranges as ranges."""
-    squared, first, second, _ = _law(noise, n_tags).tolist()
-    return np.array([0.5 * first, 0.0] if squared else [first, second])
+    zones, fixed = np.array(rows), problem.fixed
+    places = drawn.places, for_swaps
+    return _scenery(problem, problem.context, *places, zones=zones, fixed=fixed, even=True)
 
 
 def _rows_of(obstacles: Obstacles) -> FloatArray:
-    """Return boxes around obstacles, and their information fractions: (K, 7)."""
-    prisms = obstacles.prisms
-    boxes = np.concatenate(
-        [obstacles.boxes, np.full((len(obstacles.boxes), 1), obstacles.blocked_information)], axis=1
-    )
+    """Return boxes around obstacles, and their information fractions: (..., K, 7)."""
+    boxes, prisms = obstacles.boxes, obstacles.prisms
     low, high = prisms.limits[:, [0, 2, 4]], prisms.limits[:, [1, 3, 5]]
     share = np.where(np.isnan(prisms.share), obstacles.blocked_information, prisms.share)
-    of_prisms = np.concatenate([0.5 * (low + high), 0.5 * (high - low), share[:, None]], axis=1)
-    return np.concatenate([boxes, of_prisms])
+    others = np.concatenate([0.5 * (low + high), 0.5 * (high - low), share[:, None]], axis=1)
+    blocked = np.full((*boxes.shape[:-1], 1), obstacles.blocked_information)
+    others = np.broadcast_to(others, (*boxes.shape[:-2], *others.shape))
+    return np.concatenate([np.concatenate([boxes, blocked], axis=-1), others], axis=-2)
 
 
 def _scenery(
-    region: Region,
-    obstacles: Obstacles,
-    rows: FloatArray,
-    gain: Gain,
-    for_swaps: bool,
-    **known: Any,
+    task: PlacementTask, context: Context, places: FloatArray, for_swaps: bool, **known: Any
 ) -> Scenery:
-    """Return the remaining fields from the region, the obstacles, and the gain."""
-    zones, places = known["zones"], known["places"]
-    batch = zones.shape[:-2]
+    """Return the remaining fields from the task and its context."""
+    scene, obstacles, zones = task.scene, task.obstacles_in(context), known["zones"]
+    region, batch = scene.anchor_region, zones.shape[:-2]
     kind = _KINDS.get(type(region), "mounts")
     spots, shown = np.zeros((0, 3)), SHOWN.get(kind, 0)
     number = FOR_SWAPS[kind] if for_swaps and kind in SHOWN else shown
@@ -142,27 +78,28 @@ def _scenery(
     candidates, normals = (
         np.broadcast_to(x, (*batch, *x.shape)) for x in (spots, region.normal(spots))
     )
-    seen = np.ones((*batch, places.shape[-2], candidates.shape[-2]))
-    if candidates.shape[-2]:
-        seen = obstacles.share(candidates, places) if obstacles else seen
-        if gain:
-            offsets = places[..., :, None, :] - candidates[..., None, :, :]
-            seen = seen * gain.share(offsets, normals[..., None, :, :])
+    numbers = ranging.numbers_of(scene.noise, len(scene.tags))
+    assert numbers is not None  # the laws of scenes have numbers
+    squared, first, second, _ = numbers.tolist()
     low, high = region.bounds()
     corner = zones[..., :3] - zones[..., 3:6], zones[..., :3] + zones[..., 3:6]
     origin = 0.5 * (corner[0].min(axis=-2) + corner[1].max(axis=-2))
-    nearest = np.linalg.norm(region.project(origin) - origin, axis=-1)
     return Scenery(
         kind=KINDS.index(kind),
         low=low,
         high=high,
         inner=np.asarray(region.inner_m if isinstance(region, Shell) else 0.0),
-        obstacles=rows,
-        gain=gain.numbers,
-        nearest=nearest,
+        obstacles=_rows_of(obstacles),
+        tags=scene.body,
+        # Squared ranges as ranges.
+        noise=np.array([0.5 * first, 0.0] if squared else [first, second]),
+        gain=scene.gain.numbers,
+        extent=np.full(batch, float(np.ptp(scene.volume.bounds(), axis=0).max())),
+        nearest=np.linalg.norm(region.project(origin) - origin, axis=-1),
+        places=places,
         candidates=candidates,
         normals=normals,
-        seen=seen,
+        seen=link_shares(scene, obstacles, candidates, places),
         shown=shown,
         **known,
     )

@@ -15,38 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym import bounds
-from rbl_gym.bounds.information import link_information
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.placement.exchange import MULTIPLICITY, packed
-from rbl_gym.placement.problem import weighted_square
-from rbl_gym.placement.tokens import Scenery
+from rbl_gym.placement.setting import Setting
 
-__all__ = ["Poses", "State", "better", "bound_of", "evaluated", "occupied", "swapped"]
-
-# Information without any anchor.
-_NONE = np.zeros((6, 6))
-
-
-class Poses(NamedTuple):
-    """Poses of the score, at `Scenery.places`.
-
-    Attributes
-    ----------
-    rotation, weight
-        Rotations (P, 3, 3) and weights (P,).
-    prior
-        Information (P, 6, 6) without any anchor.
-    fixed_share
-        Information fractions (..., P, F) of the links of fixed anchors.
-    law
-        Numbers (4,) of the noise law, as `ranging.numbers_of` gives them.
-    """
-
-    rotation: FloatArray
-    weight: FloatArray
-    prior: FloatArray
-    fixed_share: FloatArray
-    law: FloatArray
+__all__ = ["State", "better", "bound_of", "evaluated", "occupied", "swapped"]
 
 
 class Bound(NamedTuple):
@@ -54,19 +27,15 @@ class Bound(NamedTuple):
 
     Attributes
     ----------
-    seen, poses
+    setting
         The problem.
-    prior
-        Information (..., P, 6, 6) with that of fixed anchors.
     spread
         Mean of ``J_n^T J_n`` (P, 6, 6).
     candidates
         Upper halves of the information of each candidate alone, (..., P, 21, C).
     """
 
-    seen: Scenery
-    poses: Poses
-    prior: FloatArray
+    setting: Setting
     spread: FloatArray
     candidates: FloatArray
 
@@ -90,21 +59,19 @@ class State(NamedTuple):
     decrease: FloatArray
 
 
-def bound_of(seen: Scenery, poses: Poses) -> Bound:
-    """Return what gives the score of a problem."""
-    J = bounds.tag_jacobian(poses.rotation, seen.tags)
-    spread = np.einsum("pnia,pnib->pab", J, J) / len(seen.tags)
-    bound = Bound(seen, poses, poses.prior, spread, _NONE)
-    prior = poses.prior + _of_each(bound, seen.fixed, poses.fixed_share).sum(axis=-4)
-    told = packed(_of_each(bound, seen.candidates, seen.seen)).astype(np.float32)
-    return bound._replace(prior=prior, candidates=np.moveaxis(told, -3, -1).copy())
+def bound_of(setting: Setting, candidates: FloatArray) -> Bound:
+    """Return what gives the score of a problem with candidates (..., C, 3)."""
+    J = bounds.tag_jacobian(setting.sample.rotation, setting.scene.body)
+    spread = np.einsum("pnia,pnib->pab", J, J) / J.shape[-3]
+    told = packed(setting.parts(candidates)).astype(np.float32)
+    return Bound(setting, spread, np.moveaxis(told, -3, -1).copy())
 
 
-def evaluated(bound: Bound, points: FloatArray, share: FloatArray) -> State:
-    """Return the state of layouts (..., M, 3), given information fractions (..., P, M)."""
-    told = _of_each(bound, points, share)
-    total = told.sum(axis=-4) + bound.prior
-    score = np.sqrt(_square(bound, total))
+def evaluated(bound: Bound, points: FloatArray) -> State:
+    """Return the state of layouts (..., M, 3)."""
+    told = bound.setting.parts(points)
+    total = told.sum(axis=-4) + bound.setting.sample.prior
+    score = np.sqrt(bound.setting.squares(total))
     if not bound.candidates.shape[-1]:
         return State(points, score, np.zeros((*points.shape[:-1], 0)))
     P = np.linalg.inv(total[..., None, :, :, :] - told)
@@ -115,7 +82,7 @@ def evaluated(bound: Bound, points: FloatArray, share: FloatArray) -> State:
     # the same kind.
     by = (MULTIPLICITY * packed(K) / squares[..., None]).astype(np.float32)
     gain = np.maximum(np.swapaxes(by, -2, -3) @ bound.candidates, 0.0)
-    weighted = bound.poses.weight * squares
+    weighted = bound.setting.sample.weight * squares
     left = np.einsum("...mp,...pmc->...mc", weighted, 1 / (1 + gain))
     gain = np.maximum(np.einsum("...a,...a->...", by, packed(told)), 0.0)
     own = (weighted / (1 + gain)).sum(axis=-1, keepdims=True)
@@ -155,26 +122,3 @@ def better(old: State, new: State) -> tuple[State, BoolArray]:
         for x, y in zip(map(np.asarray, new), map(np.asarray, old), strict=True)
     )
     return State(*fields), is_new
-
-
-def _square(bound: Bound, information: FloatArray) -> FloatArray:
-    poses = bound.poses
-    return weighted_square(information, poses.rotation, bound.seen.tags, poses.weight)
-
-
-def _of_each(bound: Bound, anchors: FloatArray, share: FloatArray) -> FloatArray:
-    """Return the information (..., M, P, 6, 6) of each anchor alone."""
-    places, tags = bound.seen.places[..., None, :, :], bound.seen.tags
-    if not anchors.shape[-2]:
-        return np.zeros((*anchors.shape[:-1], places.shape[-2], 6, 6))
-    links = np.swapaxes(share, -1, -2)[..., None, None]
-    links = np.broadcast_to(links, (*links.shape[:-1], len(tags)))
-    return link_information(
-        _NONE,
-        anchors[..., None, None, :],
-        tags,
-        bound.poses.rotation,
-        places,
-        bound.poses.law,
-        links,
-    )

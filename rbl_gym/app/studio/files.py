@@ -260,8 +260,8 @@ def tables_of(problem: Problem) -> dict[str, Any]:
         | {k: v for k, v in values.items() if v is not None}
         | {"blocked_information": problem.obstacles.blocked_information},
         "prior": {
-            "rotation_deg": float(np.rad2deg(problem.prior.rotation_rad)),
-            "position_m": problem.prior.position_m,
+            "rotation_deg": float(np.rad2deg(problem.scene.initial_rotation_rad)),
+            "position_m": problem.scene.initial_translation_m,
         },
     }
     tables["anchors"] |= _reach(problem)

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from rbl_gym.app.studio.state import Layout, State, set_layout, with_one_more
-from rbl_gym.checks import FloatArray
 from rbl_gym.placement.descent import descend
 from rbl_gym.placement.exchange import refresh
 from rbl_gym.placement.file_keys import MAX_ANCHORS
-from rbl_gym.placement.setting import Setting
 from rbl_gym.studies.placing import choosing
 
 __all__ = ["add_best", "optimise"]
@@ -60,7 +58,7 @@ def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:
     if not len(free):
         yield 1.0, state
         return
-    setting = _with_fixed(world.setting, start[fixed])
+    setting = world.setting.with_fixed(start[fixed])
     rng = np.random.default_rng([seed, len(start)])
     best, least, reached = state, state.score, start[free]
     for number in range(_ROUNDS):
@@ -81,10 +79,3 @@ def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:
             break
         yield (number + 1) / _ROUNDS, best
     yield 1.0, best
-
-
-def _with_fixed(setting: Setting, fixed: FloatArray) -> Setting:
-    """Return the setting in which fixed anchors count as known."""
-    if not len(fixed):
-        return setting
-    return setting._replace(sample=setting.sample._replace(prior=setting.told(fixed)))

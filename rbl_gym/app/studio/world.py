@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, as_tuples
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.sample import Sample, sample
@@ -90,10 +90,13 @@ class World:
             law: Any = base.noise
             changes["noise"] = dataclasses.replace(law, **{noise_field(base): now.noise_m})
         if now[1:3] != was[1:3]:
-            changes["tags"] = _tags(base.tags, now.n_tags, now.size_m)
+            changes["tags"] = as_tuples(_tags(base.tags, now.n_tags, now.size_m))
         if now.loss_db != was.loss_db:
-            changes["obstacles"] = _with_loss(base.obstacles, now.loss_db)
-        return dataclasses.replace(base, **changes) if changes else base
+            changes["blocked_information"] = 10 ** (-now.loss_db / 10)
+            changes["prisms"] = _with_loss(base.obstacles, now.loss_db)
+        if not changes:
+            return base
+        return dataclasses.replace(base, scene=dataclasses.replace(base.scene, **changes))
 
     @functools.cached_property
     def sample(self) -> Sample:
@@ -103,15 +106,7 @@ class World:
     @functools.cached_property
     def setting(self) -> Setting:
         """The setting that compares layouts; no anchor counts as fixed."""
-        problem = self.problem
-        return Setting(
-            problem.tags,
-            problem.noise,
-            self.sample,
-            problem.mounts,
-            problem.obstacles,
-            problem.gain,
-        )
+        return Setting(self.problem.scene, self.sample, self.problem.obstacles)
 
     @functools.cached_property
     def places(self) -> tuple[FloatArray, ...]:
@@ -145,10 +140,8 @@ def _tags(tags: FloatArray, count: int, size_m: float) -> FloatArray:
     return tags * (size_m / float(np.ptp(tags, axis=0).max()))
 
 
-def _with_loss(obstacles: Obstacles, db: float) -> Obstacles:
-    """Return obstacles with another loss; shares of their own change in proportion."""
-    was = loss_db(obstacles.blocked_information)
-    prisms = obstacles.prisms
+def _with_loss(obstacles: Obstacles, db: float) -> Prisms:
+    """Return prisms for another loss of obstacles; shares of their own change in proportion."""
+    was, prisms = loss_db(obstacles.blocked_information), obstacles.prisms
     share = prisms.share ** (db / was) if was > 0 else prisms.share
-    changed = Prisms(prisms.corners, prisms.low_m, prisms.high_m, share)
-    return Obstacles(obstacles.boxes, 10 ** (-db / 10), changed)
+    return dataclasses.replace(prisms, share=share)

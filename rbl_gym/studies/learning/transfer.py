@@ -345,7 +345,8 @@ def _tag_rmse(
     scene, tags = task.scene, np.asarray(task.scene.tags)
     kind, options, reflections = FILTERS[name]
     anchors = np.repeat(anchors, repeats, axis=0)
-    obstacles = task.obstacles(Context(*(np.repeat(field, repeats, axis=0) for field in contexts)))
+    repeated = Context(*(np.repeat(field, repeats, axis=0) for field in contexts))
+    obstacles = task.obstacles_in(repeated)
     laws = {"tags": tags, "noise": scene.noise, "process": scene.process}
     filter = estimators.make(kind, **laws, **options)
     readings = _readings(scene, obstacles, anchors, bodies, reflections)

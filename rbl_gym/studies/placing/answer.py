@@ -386,8 +386,8 @@ def _comparison(
 
 def _criteria(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
     """Return the criteria as numbers; None if undefined (conditioning of coplanar anchors)."""
-    task = design.free_task(scene_files.with_anchors(problem, len(anchors)), _MANY_POSES)
-    values = criteria.criteria(task, problem.context, anchors)._asdict()
+    many = dataclasses.replace(problem, n_anchors=len(anchors), n_poses=_MANY_POSES)
+    values = criteria.criteria(many, problem.context, anchors)._asdict()
     numbers = {name: float(value) for name, value in values.items()}
     if _is_flat(anchors):
         numbers["conditioning"] = math.inf

@@ -118,8 +118,8 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
         result["locate, from nothing"] = _figures(problem, drawn, found, bound, seed)
     return {
         "trials": trials,
-        "prior_rotation_deg": float(np.rad2deg(problem.prior.rotation_rad)),
-        "prior_position_m": problem.prior.position_m,
+        "prior_rotation_deg": float(np.rad2deg(problem.scene.initial_rotation_rad)),
+        "prior_position_m": problem.scene.initial_translation_m,
         "filters": result,
     }
 
@@ -177,8 +177,8 @@ def draw_bodies(
     links = (weight > 0) & (ranges > _LEAST_RANGE_M)
     ranges = np.maximum(ranges, _LEAST_RANGE_M)
     std = np.sqrt(problem.noise.variance(ranges)) * np.where(weight > 0, scale, 1.0)
-    prior_std = np.empty((trials, 6))
-    prior_std[:, :3], prior_std[:, 3:] = problem.prior
+    turned, moved = problem.scene.initial_rotation_rad, problem.scene.initial_translation_m
+    prior_std = np.tile([turned] * 3 + [moved] * 3, (trials, 1))
     prior_std[known, :2] = _KNOWN_RAD
     offset = prior_std * rng.standard_normal((trials, 6))
     return DrawnBodies(

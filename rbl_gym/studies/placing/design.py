@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 
 from rbl_gym import placement
 from rbl_gym.checks import FloatArray, check_one_of
-from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.placement import amortised, design, layouts
 from rbl_gym.placement.building import Problem
-from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.placement.problem import Context
 from rbl_gym.studies.placing import judging
 from rbl_gym.studies.progress import Advance, silent
 
@@ -24,41 +22,12 @@ __all__ = [
     "usual_layouts",
 ]
 
-# Number of poses over which the usual layouts are compared.
-_N_POSES = 64
 # Methods of the search: `placement.design`, or `placement.amortised` with this many steps.
 STARTS, _EVALUATIONS = ("search", "amortised"), 20
 # Usual layouts that are also start layouts of the search, if there are no obstacles.
 _STARTS = ("grid", "ring")
 # The layout "random" is the median of this many random layouts.
 _RANDOM_DRAWS = 25
-
-
-class FreeTask(PlacementTask):
-    """A task scored over poses in the zones of a problem, outside its obstacles."""
-
-    problem: Problem
-
-    def obstacles(self, context: Context) -> Obstacles:
-        """Return the obstacles of the problem."""
-        return self.problem.obstacles
-
-    @functools.cached_property
-    def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Return rotations (P, 3, 3) and offsets (P, 3), spread evenly over the free space."""
-        low, high = self.scene.volume.bounds()
-        # If fewer positions are free than needed, they are repeated.
-        places = np.resize(self.problem.free_places(self.n_poses), (self.n_poses, 3))
-        half = 0.5 * (high - low)
-        offsets = (places - 0.5 * (low + high)) / np.where(half > 0, half, 1.0)
-        return PlacementTask(self.scene, self.n_anchors, n_poses=self.n_poses).poses[0], offsets
-
-
-def free_task(problem: Problem, n_poses: int) -> FreeTask:
-    """Return the task of the problem over a number of free poses."""
-    task = FreeTask(problem.scene, problem.n_anchors, n_poses=n_poses)
-    object.__setattr__(task, "problem", problem)
-    return task
 
 
 class Design(NamedTuple):
@@ -94,10 +63,8 @@ def design_layout(
         One of `STARTS`: the method of the search.
     """
     check_one_of("start", begin, STARTS)
-    context, fixed = problem.context, problem.fixed
-    task = free_task(problem, _N_POSES)
-    rng = np.random.default_rng([seed, problem.n_anchors])
-    drawn = {} if len(fixed) else usual(task, context, rng)
+    fixed, rng = problem.fixed, np.random.default_rng([seed, problem.n_anchors])
+    drawn = {} if len(fixed) else usual(problem, rng)
     starts = {}
     if isinstance(problem.mounts, Box | Shell | Walls) and not problem.obstacles:
         starts = {name: layout for name, layout in drawn.items() if name in _STARTS}
@@ -121,7 +88,7 @@ def design_layout(
     # Evaluated at more positions than the search has used.
     scores = {name: judging.score_of(problem, x, seed) for name, x in legal.items()}
     best = min(scores, key=scores.__getitem__)
-    ordered = _in_order(legal[best][len(fixed) :], context.centre)
+    ordered = _in_order(legal[best][len(fixed) :], problem.context.centre)
     return Design(np.concatenate([fixed, ordered]), best, searched)
 
 
@@ -149,17 +116,17 @@ def _repeated(context: Context, count: int) -> Context:
 
 def usual_layouts(problem: Problem, seed: int) -> dict[str, FloatArray]:
     """Return the usual layouts (M, 3) of a problem by their names."""
-    rng = np.random.default_rng([seed, 2])
-    return usual(free_task(problem, _N_POSES), problem.context, rng)
+    return usual(problem, np.random.default_rng([seed, 2]))
 
 
-def usual(task: PlacementTask, context: Context, rng: np.random.Generator) -> dict[str, FloatArray]:
+def usual(problem: Problem, rng: np.random.Generator) -> dict[str, FloatArray]:
     """Return the usual layouts; `random` is the median of many draws."""
+    context = problem.context
     found = {
-        name: layout(task, context, rng)
+        name: layout(problem, context, rng)
         for name, layout in layouts.LAYOUTS.items()
         if name != "random"
     }
-    many = layouts.random(task, _repeated(context, _RANDOM_DRAWS), rng)
-    order = np.argsort(placement.score(task, _repeated(context, _RANDOM_DRAWS), many))
+    many = layouts.random(problem, _repeated(context, _RANDOM_DRAWS), rng)
+    order = np.argsort(placement.score(problem, context, many))
     return found | {"random": many[order[_RANDOM_DRAWS // 2]]}

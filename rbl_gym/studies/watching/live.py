@@ -122,8 +122,8 @@ def stage_of_problem(problem: Problem, anchors: FloatArray, steps: int | None = 
         process=dataclasses.replace(
             problem.scene.process, rotation_rad=_ROTATION_RAD, translation_m=_TRANSLATION_M
         ),
-        initial_rotation_rad=min(problem.prior.rotation_rad, 0.2),
-        initial_translation_m=min(problem.prior.position_m, 0.5),
+        initial_rotation_rad=min(problem.scene.initial_rotation_rad, 0.2),
+        initial_translation_m=min(problem.scene.initial_translation_m, 0.5),
     )
 
     def share(anchors: FloatArray, place: FloatArray) -> FloatArray:

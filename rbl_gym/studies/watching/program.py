@@ -10,12 +10,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rbl_gym.checks import FloatArray
-from rbl_gym.geometry.obstacles import Obstacles
+from rbl_gym.checks import FloatArray, as_tuples
 from rbl_gym.geometry.regions import Box
-from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import RangeNoise
-from rbl_gym.placement.building import Prior, Problem, Zone
+from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.recordings import Recording
 from rbl_gym.studies.replay import Settings, Track
 from rbl_gym.studies.watching.frames import Frame, filter_named
@@ -199,28 +197,16 @@ def env_program(
     base: Any = env.unwrapped
     scene = base.task.scene
     centre, half = np.split(np.asarray(info["region"], float), 2)
-    racks = dataclasses.replace(scene.obstruction, boxes=np.asarray(info["racks"], float))
-    room = dataclasses.replace(
-        room_of(scene), zones=(_zone(centre - half, centre + half),), obstacles=racks
-    )
+    racks = np.asarray(info["racks"], float).reshape(-1, 6)
+    region = Box(as_tuples(centre - half), as_tuples(centre + half))
+    racks = as_tuples(racks[racks[:, 3] > 0])
+    room = room_of(dataclasses.replace(scene, volume=region, obstacles=racks))
     return Program(title, room, scene.body, start, (), seed)
 
 
 def room_of(scene: Scene) -> Problem:
     """Return the drawing of a scene."""
-    low, high = scene.volume.bounds()
-    return Problem(
-        scene.name,
-        scene.body,
-        scene.noise,
-        scene.obstruction,
-        scene.anchor_region,
-        (_zone(low, high),),
-        scene.n_anchors,
-        np.empty((0, 3)),
-        Gain(),
-        Prior(1.0, 1.0),
-    )
+    return Problem(scene, scene.n_anchors, zones=(_zone(*scene.volume.bounds()),))
 
 
 def room_around(name: str, places: FloatArray, tags: FloatArray) -> Problem:
@@ -228,12 +214,18 @@ def room_around(name: str, places: FloatArray, tags: FloatArray) -> Problem:
     found = places[np.isfinite(places).all(axis=1)]
     # A filter that was lost for a while does not enlarge the room.
     low, high = np.quantile(found, [0.01, 0.99], axis=0)
-    low, high = low - _MARGIN_M, high + _MARGIN_M
-    region = Box(tuple(low.tolist()), tuple(high.tolist()))
-    none, noise = Obstacles(np.empty((0, 6)), 1.0), RangeNoise(0.1)
-    fixed = np.empty((0, 3))
-    zones = (_zone(low, high),)
-    return Problem(name, tags, noise, none, region, zones, 1, fixed, Gain(), Prior(1.0, 1.0))
+    zone = _zone(low - _MARGIN_M, high + _MARGIN_M)
+    region = Box(*(as_tuples(corner) for corner in zone.bounds()))
+    return Problem.of(
+        (zone,),
+        1,
+        name=name,
+        tags=as_tuples(tags),
+        noise=RangeNoise(0.1),
+        anchor_region=region,
+        initial_rotation_rad=1.0,
+        initial_translation_m=1.0,
+    )
 
 
 def _zone(low: FloatArray, high: FloatArray) -> Zone:
