@@ -8,6 +8,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from rbl_gym import placement
 from rbl_gym.checks import as_tuples
@@ -19,15 +20,14 @@ from rbl_gym.placement import (
     attention,
     building,
     dilution,
-    following,
+    exchange,
     layouts,
     scene_files,
     scenery,
     search,
     setting,
-    swaps,
 )
-from rbl_gym.placement.descent import descend
+from rbl_gym.placement.descent import descend, follow
 from rbl_gym.placement.sample import sample
 from rbl_gym.placement.tokens import KINDS, Scenery, Tokens, tokens_of
 from rbl_gym.studies.placing import design
@@ -186,14 +186,14 @@ def room_state(n_anchors=6, batch=(2,)):
     """A room with two racks, layouts at random candidates, and their state."""
     task, contexts = problem("uwb_room", n_anchors, 2, batch, seed=8)
     seen = scenery.of_task(task, contexts, for_swaps=True)
-    bound = swaps.bound_of(setting.of_task(task, contexts), seen.candidates)
+    bound = exchange.bound_of(setting.of_task(task, contexts), seen.candidates)
     rng = np.random.default_rng(1)
     number = seen.candidates.shape[-2]
     index = np.stack([rng.permutation(number)[:n_anchors] for _ in range(*batch)])
     points = np.take_along_axis(seen.candidates, index[..., None], axis=-2)
 
     def judged(layouts):
-        return swaps.evaluated(bound, layouts)
+        return exchange.evaluated(bound, layouts)
 
     return task, contexts, seen.candidates, judged, judged(points)
 
@@ -208,9 +208,9 @@ def test_the_score_of_a_state_is_the_score():
 def test_a_swap_is_nearly_the_best_of_all():
     """Brute force over all pairs: the swap by the estimate gains most of what the best one does."""
     task, contexts, candidates, judged, state = room_state()
-    tried = swaps.occupied(state.points, candidates)
+    tried = exchange.occupied(state.points, candidates)
     assert tried.sum() == 2 * 6 * 6
-    points, pair = swaps.swapped(state, candidates, tried)
+    points, pair = exchange.swapped(state, candidates, tried)
     np.testing.assert_array_equal(pair.sum(axis=(-1, -2)), [1, 1])
     moved = np.broadcast_to(state.points[:, None, None], (2, 6, candidates.shape[-2], 6, 3)).copy()
     for m in range(6):
@@ -223,8 +223,8 @@ def test_a_swap_is_nearly_the_best_of_all():
 
 def test_the_better_state_is_kept_in_each_problem():
     *_, state = room_state()
-    other = swaps.State(state.points + 1.0, state.score * [0.5, 2.0], state.decrease)
-    kept, is_new = swaps.better(state, other)
+    other = exchange.State(state.points + 1.0, state.score * [0.5, 2.0], state.decrease)
+    kept, is_new = exchange.better(state, other)
     np.testing.assert_array_equal(is_new, [True, False])
     np.testing.assert_array_equal(kept.points, [other.points[0], state.points[1]])
 
@@ -250,7 +250,7 @@ def test_no_more_evaluations_than_asked(monkeypatch, scene, racks, evaluations):
         return call
 
     monkeypatch.setattr(setting, "of_arrays", counted(setting.of_arrays))
-    monkeypatch.setattr(swaps, "evaluated", counted(swaps.evaluated))
+    monkeypatch.setattr(exchange, "evaluated", counted(exchange.evaluated))
     task, contexts = problem(scene, 5, racks)
     amortised.of_task(task, contexts, evaluations)
     assert len(count) <= evaluations
@@ -364,13 +364,8 @@ def test_following_many_layouts_is_as_good_as_one_at_a_time(scene, n_anchors):
         setting.of_task(task, placement.Context(*(field[k] for field in contexts)))
         for k in range(6)
     ]
-
-    def evaluate(points):
-        found = [one.score_and_gradient(x) for one, x in zip(settings, points, strict=True)]
-        score, gradient = zip(*found, strict=True)
-        return np.array(score), np.array(gradient)
-
-    found = following.follow(evaluate, task.scene.anchor_region, start, 20)
+    evaluate = setting.of_task(task, contexts).score_and_gradient
+    found = follow(evaluate, task.scene.anchor_region, start, 20)
     assert placement.is_legal(task, found).all()
     before, after = (np.log(placement.score(task, contexts, x)) for x in (start, found))
     scipys = [np.log(descend(one, x, 20)[1]) for one, x in zip(settings, start, strict=True)]
@@ -388,11 +383,36 @@ def test_following_stays_where_it_is_legal():
         return np.exp(square), 2 * gap * np.exp(square)[:, None, None]
 
     start = np.array([[[-0.5, -0.5, 0.5]], [[0.2, 0.1, 0.9]]])
-    free = following.follow(evaluate, region, start, 25)
+    free = follow(evaluate, region, start, 25)
     np.testing.assert_allclose(free, np.broadcast_to(goal, free.shape), atol=1e-3)
-    held = following.follow(evaluate, region, start, 25, lambda points: points[..., 0] < 0.3)
+    held = follow(evaluate, region, start, 25, lambda points: points[..., 0] < 0.3)
     assert (held[..., 0] < 0.3).all()
     assert (evaluate(held)[0] < evaluate(start)[0]).all()
+
+
+def test_following_is_as_good_as_scipy_on_quadratics():
+    """Badly scaled bowls in a box, some with the minimum outside: scipy's with as many steps."""
+    rng, region = np.random.default_rng(0), Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    turned = np.linalg.qr(rng.standard_normal((8, 6, 6)))[0]
+    bowls = turned * np.geomspace(1, 100, 6) @ np.swapaxes(turned, -1, -2)
+    goals = rng.uniform(-1.2, 1.2, (8, 6))
+
+    def evaluate(points):
+        gap = points.reshape(8, 6) - goals
+        slope = np.einsum("bij,bj->bi", bowls, gap)
+        score = np.exp(0.5 * (gap * slope).sum(axis=-1))
+        return score, (score[:, None] * slope).reshape(points.shape)
+
+    start = rng.uniform(-1, 1, (8, 2, 3))
+    found = np.log(evaluate(follow(evaluate, region, start, 60))[0])
+    for k in range(8):
+
+        def one(x, k=k):
+            gap = x - goals[k]
+            return 0.5 * gap @ bowls[k] @ gap, bowls[k] @ gap
+
+        best = optimize.minimize(one, start[k].ravel(), jac=True, bounds=[(-1, 1)] * 6).fun
+        assert found[k] < best + 1e-4 * (one(start[k].ravel())[0] - best)
 
 
 # --- against torch ---------------------------------------------------------------------------

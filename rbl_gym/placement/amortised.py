@@ -20,10 +20,10 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray, check_count
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
-from rbl_gym.placement import dilution, scenery, setting, swaps
+from rbl_gym.placement import dilution, exchange, scenery, setting
 from rbl_gym.placement.attention import MOST, chosen, forward
 from rbl_gym.placement.building import Problem, cube
-from rbl_gym.placement.following import follow
+from rbl_gym.placement.descent import follow
 from rbl_gym.placement.problem import Context, PlacementTask, link_shares
 from rbl_gym.placement.sample import sample
 from rbl_gym.placement.tokens import (
@@ -170,17 +170,17 @@ def _illegal(play: _Play, candidates: FloatArray) -> BoolArray:
 
 def _swapped(network: Network, play: _Play, evaluations: int) -> tuple[FloatArray, int]:
     """Return anchors (..., M, 3) after mirror images and swaps, and the number of evaluations."""
-    candidates, bound = play.seen.candidates, swaps.bound_of(play.judge, play.seen.candidates)
-    best, used = swaps.evaluated(bound, _placed(network, play)), 1
+    candidates, bound = play.seen.candidates, exchange.bound_of(play.judge, play.seen.candidates)
+    best, used = exchange.evaluated(bound, _placed(network, play)), 1
     for image in range(1, min(_IMAGES, evaluations)):
-        best, _ = swaps.better(best, swaps.evaluated(bound, _placed(network, play, image)))
+        best, _ = exchange.better(best, exchange.evaluated(bound, _placed(network, play, image)))
         used += 1
     illegal = _illegal(play, candidates)[..., None, :]
-    tried = illegal | swaps.occupied(best.points, candidates)
+    tried = illegal | exchange.occupied(best.points, candidates)
     while used < min(_IMAGES + _SWAPS, evaluations) and (best.decrease > 0)[~tried].any():
-        points, pair = swaps.swapped(best, candidates, tried)
-        best, is_new = swaps.better(best, swaps.evaluated(bound, points))
-        fresh = illegal | swaps.occupied(best.points, candidates)
+        points, pair = exchange.swapped(best, candidates, tried)
+        best, is_new = exchange.better(best, exchange.evaluated(bound, points))
+        fresh = illegal | exchange.occupied(best.points, candidates)
         tried = np.where(is_new[..., None, None], fresh, tried | pair)
         used += 1
     return best.points, used
@@ -204,8 +204,8 @@ def of_task(
     evaluations
         Largest number of evaluations of the score and its derivatives after the network. With
         obstacles, or on mounts, the first 2 compare the network's layouts for the problem and a
-        mirror image, up to 10 are swaps of an anchor for a candidate, see `swaps`. The others are
-        for gradient steps. 0: none.
+        mirror image, up to 10 are swaps of an anchor for a candidate, see `exchange`. The others
+        are for gradient steps. 0: none.
     network
         None selects the network of the package.
 
