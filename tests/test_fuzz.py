@@ -3,7 +3,7 @@
 Every public function of `fuzz_cases` is called with one argument spoilt at a time, once through a
 table of other types, NaN, inf, huge, tiny, empty, negative and other shapes, and with what
 hypothesis makes of them. NaN and inf must never be taken for numbers. docs/fuzzing.md says what
-was found.
+is tried.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WRONG: list[Any] = [
 ]  # fmt: skip
 NO_NUMBERS = [float("nan"), float("inf"), float("-inf")]
 SIZES = [1e-320, 1e-300, 1e-200, 1e-12, 1e12, 1e160, 1e300, -1e300, 0.0, -1.0, *NO_NUMBERS]
-EXAMPLES = 4  # of each argument; docs/fuzzing.md says for how many it was run
+EXAMPLES = 4  # of each argument
 
 ARGUMENTS = [
     (name, argument)

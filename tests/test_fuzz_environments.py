@@ -1,7 +1,7 @@
 """Environments of every id, scalar and vector, and wrappers: arguments, actions, resets, seeds.
 
 Whatever comes in: episodes whose observations lie in their space, or a ValueError or TypeError
-that names the argument, or Gymnasium's own error. docs/fuzzing.md says what was found.
+that names the argument, or Gymnasium's own error. docs/fuzzing.md says what is tried.
 """
 
 from __future__ import annotations

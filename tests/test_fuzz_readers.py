@@ -1,7 +1,7 @@
 """Files with bytes changed at random: read, or a ValueError that names the file.
 
 `benchmarks/fuzz_readers.py` does the same for longer, led by coverage; docs/fuzzing.md says what
-was found.
+is tried.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rbl_gym.recordings import Files, Format, read_recording
 from tests import fuzz_files
 from tests.fuzz_files import READERS, check
 
-MUTANTS = 40  # of each good file; docs/fuzzing.md says for how many it was run
+MUTANTS = 40  # of each good file; docs/fuzzing.md states it
 
 NAMES = list(READERS)
 
