@@ -72,13 +72,6 @@ def naive_range_information(anchors, tags, Q, t, law, links=None) -> np.ndarray:
     return information
 
 
-def blocks(rotation: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """blkdiag(R, scale R): a turned world in other units of length."""
-    F = np.zeros((6, 6))
-    F[:3, :3], F[3:, 3:] = rotation, scale * rotation
-    return F
-
-
 def assert_close(got, want, rtol: float = 1e-9) -> None:
     """Equal to `rtol` of the largest entry of each matrix."""
     scale = np.abs(want).max(axis=(-2, -1), keepdims=True)
@@ -115,15 +108,6 @@ def test_lost_links_tell_nothing(law):
     want = naive_range_information(*w, law, links)
     for mask in (links, links.astype(int), links.tolist()):
         assert_close(bounds.range_information(*w, law, mask), want, 1e-8)
-
-
-@PROPERTY
-@given(SEEDS)
-def test_another_link_never_tells_less(seed):
-    w = world(seed)
-    links = np.random.default_rng(seed).random((5, 5)) < 0.5
-    more = bounds.range_information(*w, LAWS[1]) - bounds.range_information(*w, LAWS[1], links)
-    assert np.linalg.eigvalsh(more).min() > -1e-9 * np.abs(more).max()
 
 
 def test_anchor_on_a_tag_tells_nothing_of_that_tag():
@@ -228,62 +212,6 @@ def test_rank_is_free_of_units(rank):
 # --- the world may be moved, renamed, measured in other units ---------------------------------
 
 
-@PROPERTY
-@given(SEEDS, st.sampled_from(LAWS))
-def test_bound_turns_with_the_world(seed, law):
-    anchors, tags, Q, t = world(seed)
-    rng = np.random.default_rng(seed)
-    R, shift = rotations.random(rng), rng.normal(0, 20, 3)
-    P = bounds.pose_crb(anchors, tags, Q, t, law)
-    moved = bounds.pose_crb(anchors @ R.T + shift, tags, R @ Q, R @ t + shift, law)
-    assert_close(moved, blocks(R) @ P @ blocks(R).T, 1e-7)
-    np.testing.assert_allclose(
-        bounds.score(moved, R @ Q, tags), bounds.score(P, Q, tags), rtol=1e-7
-    )
-
-
-@PROPERTY
-@given(SEEDS, st.sampled_from(LAWS))
-def test_bound_does_not_know_the_names_of_anchors_and_tags(seed, law):
-    anchors, tags, Q, t = world(seed)
-    rng = np.random.default_rng(seed)
-    a, c = rng.permutation(5), rng.permutation(5)
-    if law.squared_range_variance(np.ones((1, 5))).shape[-1] == 1:
-        c = np.array([0, 2, 3, 1, 4])  # the first and the last tag are references
-    P = bounds.pose_crb(anchors, tags, Q, t, law)
-    assert_close(bounds.pose_crb(anchors[a], tags[c], Q, t, law), P, 1e-8)
-    np.testing.assert_allclose(bounds.score(P, Q, tags[c]), bounds.score(P, Q, tags), rtol=1e-13)
-
-
-@PROPERTY
-@given(SEEDS, st.sampled_from(LAWS))
-def test_bound_in_millimetres_is_the_bound_in_metres(seed, law):
-    anchors, tags, Q, t = world(seed)
-    if isinstance(law, RangeNoise):
-        scaled = RangeNoise(1e3 * law.floor_m, law.proportional, law.reference_tag)
-    else:
-        scaled = SquaredRangeNoise(1e3 * law.sigma_m)
-    P = bounds.pose_crb(anchors, tags, Q, t, law)
-    got = bounds.pose_crb(1e3 * anchors, 1e3 * tags, Q, 1e3 * t, scaled)
-    units = np.diag([1.0] * 3 + [1e3] * 3)
-    assert_close(got, units @ P @ units, 1e-7)
-    np.testing.assert_allclose(
-        bounds.score(got, Q, 1e3 * tags), 1e3 * bounds.score(P, Q, tags), rtol=1e-7
-    )
-
-
-@PROPERTY
-@given(SEEDS)
-def test_score_does_not_depend_on_the_origin_of_the_body_frame(seed):
-    anchors, tags, Q, t = world(seed)
-    shift = np.random.default_rng(seed).normal(0, 3, 3)
-    there = anchors, tags - shift, Q, t + Q @ shift
-    got, want = (
-        bounds.score(bounds.pose_crb(*w, LAWS[1]), Q, w[1]) for w in ((anchors, tags, Q, t), there)
-    )
-    np.testing.assert_allclose(got, want, rtol=1e-7)
-
-
 @every_law
 @pytest.mark.parametrize("batched", [(0,), (1,), (2,), (3,), (0, 2), (0, 1, 2, 3)])
 def test_batched_arguments_are_a_loop_over_trials(law, batched):
@@ -301,15 +229,6 @@ def test_links_of_many_trials_mask_one_world():
     got = bounds.pose_crb(*w, LAWS[3], links=links)
     for mask, P in zip(links, got, strict=True):
         assert_close(P, bounds.pose_crb(*w, LAWS[3], links=mask))
-
-
-@PROPERTY
-@given(SEEDS)
-def test_trials_may_be_permuted(seed):
-    w, order = world(seed, (5,)), np.random.default_rng(seed).permutation(5)
-    anchors, tags, Q, t = (x[order] for x in w)
-    got = bounds.pose_crb(anchors, tags, Q, t, LAWS[1])
-    assert_close(got, bounds.pose_crb(*w, LAWS[1])[order])
 
 
 # --- recursions -------------------------------------------------------------------------------
@@ -388,16 +307,6 @@ def test_posterior_step_starts_from_singular_information(rank):
     assert_close(got, want, 1e-8)
 
 
-@PROPERTY
-@given(SEEDS)
-def test_information_and_covariance_are_predicted_alike(seed):
-    P, twist = draw_covariance(seed), np.random.default_rng(seed).standard_normal(6)
-    J = bounds.predict_information(np.linalg.inv(P), twist, 0.3, PROCESS)
-    np.testing.assert_allclose(
-        J @ bounds.predict_covariance(P, twist, 0.3, PROCESS), np.eye(6), atol=1e-8
-    )
-
-
 def test_posterior_steps_of_a_batch_are_a_loop():
     w, rng = world(12, (3, 2)), np.random.default_rng(0)
     J, twist = draw_covariance(0, (3, 2)), rng.standard_normal((3, 2, 6))
@@ -409,20 +318,6 @@ def test_posterior_steps_of_a_batch_are_a_loop():
             J[i], anchors, tags, Q, t, LAWS[1], twist[i], 0.2, PROCESS, links[i]
         )
         assert_close(got[i], one)
-
-
-@PROPERTY
-@given(SEEDS)
-def test_posterior_information_turns_with_the_world(seed):
-    anchors, tags, Q, t = world(seed)
-    rng = np.random.default_rng(seed)
-    R, twist, J = rotations.random(rng), rng.standard_normal(6), draw_covariance(seed)
-    F, isotropic = blocks(R), ProcessNoise(0.1, 0.3)
-    want = bounds.posterior_crb_step(J, anchors, tags, Q, t, LAWS[1], twist, 0.3, isotropic)
-    got = bounds.posterior_crb_step(
-        F @ J @ F.T, anchors @ R.T, tags, R @ Q, R @ t, LAWS[1], F @ twist, 0.3, isotropic
-    )
-    assert_close(got, F @ want @ F.T, 1e-8)
 
 
 # --- score ------------------------------------------------------------------------------------

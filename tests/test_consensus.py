@@ -315,10 +315,3 @@ def test_accuracy_is_the_bounds_from_5_to_36_loops(trials):
         assert row["ratio"]["consensus"] == pytest.approx(1, abs=tolerance)
         tolerance = 4 * np.sqrt(2 / row["edges"] / trials)
         assert row["ratio"]["measured"] * row["bound"] == pytest.approx(0.2, rel=tolerance)
-
-
-def test_psi_is_consistent_so_that_every_tree_gives_the_same_orientations():
-    edges, y, n_nodes = next(networks(1, seed=5))
-    psi = cycle_consensus(edges, y, n_nodes)
-    theta = estimators.orientations(edges, y, n_nodes, method="cycle")
-    np.testing.assert_allclose(proj(psi - theta[edges[:, 1]] + theta[edges[:, 0]]), 0, atol=1e-10)

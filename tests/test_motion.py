@@ -98,38 +98,6 @@ def test_simulated_trials_are_a_loop_over_trials():
         np.testing.assert_allclose(path.translation[index], one.translation, rtol=1e-14)
 
 
-def test_normals_of_many_trials_spread_one_trajectory():
-    start = draw_trajectory(4)
-    normals = np.random.default_rng(0).standard_normal((5, *start.twists.shape))
-    path = motion.simulate(start, 0.1, ProcessNoise(0.1, 0.1), normals)
-    one = motion.simulate(start, 0.1, ProcessNoise(0.1, 0.1), normals[3])
-    np.testing.assert_allclose(path.rotation[3], one.rotation, atol=1e-14)
-    np.testing.assert_allclose(path.translation[3], one.translation, rtol=1e-14)
-
-
-def test_many_starts_share_one_twist():
-    start = draw_trajectory(5, (4,))
-    shared = motion.constant_twist(*start[:2], np.arange(6), 7)
-    path = motion.simulate(shared, 0.1, STILL)
-    one = motion.constant_twist(start.rotation[2], start.translation[2], np.arange(6), 7)
-    np.testing.assert_allclose(path.rotation[2], motion.simulate(one, 0.1, STILL).rotation)
-
-
-@PROPERTY
-@given(SEEDS)
-def test_the_whole_world_may_be_turned_and_moved(seed):
-    rng = np.random.default_rng(seed)
-    start, R, shift = draw_trajectory(seed), rotations.random(rng), rng.standard_normal(3)
-    world = Trajectory(
-        R @ start.rotation,
-        R @ start.translation + shift,
-        (start.twists.reshape(-1, 2, 3) @ R.T).reshape(-1, 6),
-    )
-    path, moved = (motion.simulate(x, 0.3, STILL) for x in (start, world))
-    np.testing.assert_allclose(moved.rotation, R @ path.rotation, atol=1e-13)
-    np.testing.assert_allclose(moved.translation, path.translation @ R.T + shift, atol=1e-12)
-
-
 @PROPERTY
 @given(SEEDS, st.floats(0.01, 0.5))
 def test_twists_between_poses_reproduce_the_path(seed, dt):
@@ -287,12 +255,6 @@ def test_waypoints_pass_through_the_points():
     path = motion.simulate(motion.waypoints(np.eye(3), POINTS, 2.0, 0.5, 12), 0.5, STILL)
     np.testing.assert_allclose(path.translation[[0, 4, 7, 9]], POINTS[[0, 1, 2, 4]], atol=1e-14)
     np.testing.assert_allclose(path.translation[9:], [POINTS[-1]] * 4, atol=1e-14)
-
-
-def test_waypoints_keep_their_speed_within_a_leg():
-    twists = motion.waypoints(np.eye(3), POINTS, 2.0, 0.5, 12).twists
-    np.testing.assert_allclose(np.linalg.norm(twists[:9, 3:], axis=-1), 2.0)
-    np.testing.assert_allclose(twists[9:, 3:], 0, atol=1e-14)
 
 
 def test_waypoints_of_a_batch_are_a_loop():

@@ -221,7 +221,6 @@ def test_bad_region_is_refused(kind, arguments, message):
 
 # --- actions ----------------------------------------------------------------------------------
 
-ACTIONS = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
 every_action = np.stack(np.meshgrid(*[[-1.5, -1, -1e-4, 0, 1e-200, 3e-4, 0.3, 1]] * 3), axis=-1)
 
 
@@ -233,16 +232,6 @@ def test_places_of_actions_are_legal(kind, dtype):
         points = REGIONS[kind].place(some.astype(dtype))
         assert points.dtype == np.float64
         assert distance_outside(REGIONS[kind], points).max() <= 1e-9
-
-
-@pytest.mark.parametrize("kind", REGIONS)
-@settings(PROPERTY, max_examples=100)
-@given(ACTIONS)
-def test_place_of_any_action_is_legal_and_actions_are_cut(kind, action):
-    region = REGIONS[kind]
-    point = region.place(action)
-    assert distance_outside(region, point) <= 1e-9
-    np.testing.assert_array_equal(point, region.place(np.clip(action, -1, 1)))
 
 
 @every_region

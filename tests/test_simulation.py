@@ -366,23 +366,6 @@ def test_measure_of_a_batch_equals_its_episodes_one_by_one(name):
             np.testing.assert_allclose(got[b], want, rtol=1e-13)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_measurements_of_an_epoch_depend_on_no_other_epoch(name):
-    scene = change(name, steps=6, links=BAD_LINKS)
-    episode = draw(scene, 11)
-    want = simulation.measure_epoch(scene, simulation.epoch_of(episode, 3), episode.anchors)
-
-    def spoil(array: np.ndarray) -> np.ndarray:
-        others = np.arange(7) != 3
-        return np.where(others.reshape(-1, *[1] * (array.ndim - 1)), np.nan, array)
-
-    per_epoch = ("rotation", "translation", "twists", "normals", "uniforms")
-    spoilt = episode._replace(**{key: spoil(getattr(episode, key)) for key in per_epoch})
-    got = simulation.measure_epoch(scene, simulation.epoch_of(spoilt, 3), episode.anchors)
-    for a, b in zip(got, want, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def corners(scene: Scene) -> np.ndarray:
     """Legal places for anchors as far out as the region goes."""
     box = np.array(scene.anchor_region.bounds())
@@ -441,20 +424,6 @@ def test_a_range_of_zero_is_no_link():
 # --- links ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("probability", [0.0, 0.1, 0.7, 1.0])
-def test_links_drop_as_often_as_said(probability):
-    scene = change("uwb_room", links=LinkModel(drop_probability=probability))
-    episode = draw(scene, 14)
-    lost = np.concatenate(
-        [
-            ~simulation.measure_epoch(scene, simulation.epoch_of(episode, k), episode.anchors).links
-            for k in range(101)
-        ]
-    )
-    deviation = (probability * (1 - probability) / lost.size) ** 0.5
-    assert abs(lost.mean() - probability) <= 4 * deviation
-
-
 def test_links_end_at_the_reach():
     clean = SCENES["drone_yard"]
     scene = change("drone_yard", links=LinkModel(reach_m=70.0))
@@ -470,32 +439,7 @@ def test_links_end_at_the_reach():
     assert 0.1 < np.mean(seen) < 0.9
 
 
-def test_reflected_paths_are_longer_by_the_bias_and_as_frequent_as_said():
-    clean = SCENES["drone_yard"]
-    scene = change("drone_yard", links=LinkModel(nlos_probability=0.2, nlos_bias_m=3.0))
-    episode, free = draw(scene, 16), draw(clean, 16)
-    np.testing.assert_array_equal(episode.normals, free.normals)
-    flags = []
-    for k in range(101):
-        got = simulation.measure_epoch(scene, simulation.epoch_of(episode, k), episode.anchors)
-        want = (
-            simulation.measure_epoch(clean, simulation.epoch_of(free, k), free.anchors).ranges
-            + 3.0 * got.nlos
-        )
-        np.testing.assert_allclose(got.ranges, want, rtol=1e-14)
-        flags.append(got.nlos)
-    assert np.mean(flags) == pytest.approx(0.2, abs=4 * (0.16 / np.size(flags)) ** 0.5)
-
-
 # --- anchors that move ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", MOVABLE)
-def test_zero_action_keeps_the_anchors(name):
-    scene = SCENES[name]
-    anchors = draw(scene).anchors
-    moved = simulation.move_anchors(scene, anchors, np.zeros(3 * scene.n_anchors))
-    np.testing.assert_allclose(moved, anchors, rtol=0, atol=1e-12)
 
 
 def test_anchors_that_move_and_stand_outside_their_region_are_refused():
@@ -608,47 +552,6 @@ def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name)
         scale = np.sqrt(np.diag(P))
         got = np.linalg.inv(J) / np.outer(scale, scale)
         np.testing.assert_allclose(got, P / np.outer(scale, scale), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_links_that_gave_nothing_tell_nothing(name):
-    scene = change(name, steps=2)
-    episode = draw(scene, 20)
-    none = np.zeros((scene.n_anchors, len(scene.tags)), bool)
-    J, _ = scene_bounds.posterior_step(
-        scene,
-        simulation.epoch_of(episode, 0),
-        episode.anchors,
-        none,
-        None,
-        episode.prior_covariance,
-    )
-    np.testing.assert_allclose(J @ episode.prior_covariance, np.eye(6), rtol=0, atol=1e-12)
-
-
-def test_information_of_a_batch_equals_its_episodes_one_by_one():
-    scene = change("auv_buoys", steps=2)
-    batch = draw(scene, 21, (3,))
-    links = np.ones((3, scene.n_anchors, len(scene.tags)), bool)
-    first, _ = scene_bounds.posterior_step(
-        scene, simulation.epoch_of(batch, 0), batch.anchors, links, None, batch.prior_covariance
-    )
-    second, _ = scene_bounds.posterior_step(
-        scene, simulation.epoch_of(batch, 1), batch.anchors, links, first, batch.prior_covariance
-    )
-    for b in range(3):
-        alone = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
-        J = None
-        for k in (0, 1):
-            J, _ = scene_bounds.posterior_step(
-                scene,
-                simulation.epoch_of(alone, k),
-                alone.anchors,
-                links[b],
-                J,
-                alone.prior_covariance,
-            )
-        np.testing.assert_allclose(second[b], J, rtol=1e-10)
 
 
 def test_a_blocked_link_without_information_gives_no_range():

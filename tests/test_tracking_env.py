@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import multiprocessing
 from collections.abc import Iterator
 from typing import Any
@@ -12,9 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec, registry
+from gymnasium.envs.registration import registry
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env
 
 import rbl_gym
 from rbl_gym import bounds
@@ -57,13 +55,6 @@ def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> Iterator[S
 # --- Gymnasium --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "reward"), [*((name, "bound") for name in NAMES), ("uwb_room", "none")]
-)
-def test_gymnasiums_checker_has_no_complaint(name, reward):
-    check_env(gym.make(ID, scene=name, reward=reward).unwrapped, skip_render_check=True)
-
-
 def test_make_alone_finds_the_environment_in_a_spawned_worker():
     worker = multiprocessing.get_context("spawn").Process(target=gym.make, args=(ID,))
     worker.start()
@@ -77,39 +68,11 @@ def test_registration_is_idempotent():
     assert registry["RBL/Tracking-v0"] is before
 
 
-@pytest.mark.parametrize("scene", [*NAMES, OVERRIDDEN], ids=[*NAMES, "overridden"])
-def test_spec_survives_json_and_makes_the_same_environment(scene):
-    env = gym.make(ID, scene=scene, reward="none")
-    assert env.spec is not None
-    spec = EnvSpec.from_json(env.spec.to_json())
-    assert spec.kwargs == {"scene": scene, "reward": "none"}
-    assert json.loads(env.spec.to_json())["kwargs"] == spec.kwargs
-    for source in (spec, env.spec):
-        twin = gym.make(source)
-        assert twin.spec == env.spec
-        assert_same(list(rollout(twin, 6, steps=3)), list(rollout(env, 6, steps=3)))
-
-
 def test_environment_leaves_the_scene_dict_alone():
     scene = copy.deepcopy(OVERRIDDEN)
     env = TrackingEnv(scene)
     list(rollout(env))
     assert scene == OVERRIDDEN
-
-
-def test_overrides_reach_the_scene():
-    scene = TrackingEnv(OVERRIDDEN).scene
-    assert (scene.steps, scene.n_anchors, scene.dt) == (6, 4, SCENES["satellite"].dt)
-    assert scene.noise.variance(np.ones((1, 2))).item() == pytest.approx(0.04)
-    assert scene.links.drop_probability == 0.3
-
-
-@pytest.mark.parametrize("tag", [0, 1, 5])
-def test_any_tag_may_be_the_reference_of_the_noise(tag):
-    noise = {"floor_m": 0.1, "proportional": 0.01, "reference_tag": tag}
-    env = TrackingEnv(short("uwb_room", noise=noise))
-    for observation, *_ in rollout(env):
-        assert env.observation_space.contains(observation)
 
 
 def test_max_episode_steps_of_make_truncates():
@@ -155,30 +118,6 @@ def test_fast_spin_stays_in_the_space():
     for seed in range(20):
         env.reset(seed=seed)
         assert env.observation_space.contains(env.step(np.zeros(12))[0])
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_what_the_user_writes_into_observations_changes_nothing(name):
-    scene = short(name, links=LOSSY)
-    clean, spoilt = TrackingEnv(scene), TrackingEnv(scene)
-    for want, got in zip(rollout(clean, 10), rollout(spoilt, 10), strict=True):
-        assert_same(got, want)
-        for array in (*got[0].values(), *got[4].values()):
-            if isinstance(array, np.ndarray):
-                array.fill(1)
-    assert_same(list(rollout(spoilt, 10)), list(rollout(clean, 10)))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_observations_and_infos_share_no_memory(name):
-    kept = [
-        array
-        for observation, *_, info in rollout(TrackingEnv(short(name, 3)))
-        for array in (*observation.values(), *info.values())
-        if isinstance(array, np.ndarray)
-    ]
-    for i, array in enumerate(kept):
-        assert not any(np.shares_memory(array, other) for other in kept[:i])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -298,15 +237,6 @@ def test_movable_anchors_take_velocities(name):
 
 
 @pytest.mark.parametrize("name", MOVABLE)
-def test_zero_action_keeps_the_anchors(name):
-    env = TrackingEnv(short(name))
-    first = env.reset(seed=16)[0]["anchors"]
-    for _ in range(12):
-        seen = env.step(np.zeros(env.action_space.shape or (), np.float32))[0]["anchors"]
-        np.testing.assert_allclose(seen, first, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", MOVABLE)
 def test_a_full_action_moves_an_anchor_by_the_speed_limit_before_the_ranges_are_taken(name):
     env = TrackingEnv(short(name))
     first = env.reset(seed=17)[0]["anchors"]
@@ -357,26 +287,7 @@ def test_action_that_fixed_anchors_do_not_have_is_named(action):
     ("scene", "named"),
     [
         ("nowhere", "scene must be one of .*'uwb_room'.*'nowhere'"),
-        (None, "scene"),
-        (5, "scene"),
-        ({}, "name"),
-        ({"steps": 5}, "name"),
-        ({"name": "nowhere"}, "nowhere"),
         ({"name": "uwb_room", "stepz": 5}, "stepz.*steps"),
-        ({"name": "uwb_room", "steps": 0}, "steps"),
-        ({"name": "uwb_room", "steps": 5.0}, "steps"),
-        ({"name": "uwb_room", "dt": float("nan")}, "dt"),
-        ({"name": "uwb_room", "anchors": 5}, "anchors"),
-        ({"name": "uwb_room", "anchors": [[0, 0]]}, "anchors"),
-        ({"name": "uwb_room", "anchors": [[0, 0, float("inf")]]}, "anchors.*inf"),
-        ({"name": "uwb_room", "n_anchors": "six"}, "n_anchors"),
-        ({"name": "uwb_room", "links": None}, "links"),
-        ({"name": "uwb_room", "links": {"drop_probability": 2}}, "drop_probability"),
-        ({"name": "uwb_room", "links": {"drops": 0.1}}, "drops"),
-        ({"name": "uwb_room", "noise": {"kind": "loud"}}, "noise.kind.*loud"),
-        ({"name": "uwb_room", "noise": {"kind": "box", "low": [0] * 3, "high": [1] * 3}}, "noise"),
-        ({"name": "uwb_room", "process": {"rotation_rad": -1}}, "rotation_rad"),
-        ({"name": "uwb_room", "trajectory": "teleport"}, "trajectory.*teleport"),
     ],
     ids=str,
 )
