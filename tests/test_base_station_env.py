@@ -17,7 +17,6 @@ from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
 from rbl_gym.measurements import bearing
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.side_by_side import of_its_spec
 
 ID = "rbl_gym:RBL/BaseStation-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -91,16 +90,6 @@ def test_bad_arguments_are_named(changes, message):
 
 
 # --- filters ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("observation", ["dict", "flat"])
-def test_the_iterated_ekf_wraps_it(observation):
-    env = EstimatePose(gym.make(ID, scene={"steps": 5}), observation=observation)
-    first = env.reset(seed=3)
-    assert_same(of_its_spec(env).reset(seed=3), first)
-    seen = env.step(env.action_space.sample())[0]
-    assert env.observation_space.contains(first[0])
-    assert env.observation_space.contains(seen)
 
 
 def test_the_belief_is_honest_and_the_bound_is_reached():

@@ -63,10 +63,6 @@ def test_the_overrides_make_the_scene_again():
         assert again == scene
 
 
-def test_the_same_generator_draws_the_same():
-    assert [o for _, o in draws(MIXED, 20, 5)] == [o for _, o in draws(MIXED, 20, 5)]
-
-
 def test_sizes_are_those_of_the_largest():
     found = family(MIXED)
     assert (found.n_anchors, found.n_tags, found.steps) == (12, 6, 6)
@@ -301,11 +297,6 @@ def test_every_reset_draws_anew_and_says_so():
     assert info["_scene"].all()
     again = [json.loads(one)["noise"]["floor_m"] for one in info["scene"]]
     assert len({*first, *again}) == 12
-
-
-def test_an_unknown_filter_is_named():
-    with pytest.raises(ValueError, match="filter must be one of"):
-        VectorEstimatePose(TrackingVectorEnv(2, scenes=VARIED), "gold")
 
 
 def test_frames_of_many_worlds_equal_those_of_each():

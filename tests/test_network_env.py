@@ -5,12 +5,9 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
-import warnings
-
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
 from rbl_gym.estimators.networks.beliefs import consensus
@@ -38,26 +35,6 @@ def make(**arguments):
 
 def make_vec(count=3, mode="NextStep", **arguments):
     return gym.make_vec(ID, num_envs=count, autoreset_mode=mode, **arguments)
-
-
-# --- Gymnasium --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {},
-        {"n_nodes": 2},
-        {"reward": "none", "radius_m": 2.0},
-        {"lengths": "one"},
-        {"lengths": "all", "n_nodes": 3, "length_std_m": 2.0},
-    ],
-)
-def test_gymnasiums_checker_has_no_complaint(arguments):
-    check_env(make(**arguments).unwrapped, skip_render_check=True)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*different from the unwrapped version")
-        check_env(EstimateNetwork(make(**arguments), reward="belief"), skip_render_check=True)
 
 
 # --- what it measures -------------------------------------------------------------------------

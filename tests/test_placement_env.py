@@ -255,20 +255,6 @@ def test_bad_arguments_are_named(kind, arguments, message):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
-        ({"num_envs": 2.0}, "num_envs must be an int from 1 to 100000000, got 2.0"),
-        ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),
-        ({"max_episode_steps": 0}, "max_episode_steps must be"),
-    ],
-)
-def test_bad_vector_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        AnchorPlacementVectorEnv(**{"num_envs": 2, **arguments})
-
-
-@pytest.mark.parametrize(
     ("kind", "action", "message"),
     [
         ("auv", np.zeros(2), r"action must be numbers of shape \(3,\)"),
@@ -298,23 +284,6 @@ def test_bad_actions_are_named_and_change_nothing(kind, action, message):
     env.action_space.seed(1)
     good = env.action_space.sample()
     assert_same(env.step(good), peer.step(good))
-
-
-def test_bad_calls_are_named():
-    env = AnchorPlacementVectorEnv(2, autoreset_mode="Disabled", n_anchors=1)
-    with pytest.raises(ResetNeeded):
-        env.step(np.zeros((2, 3)))
-    with pytest.raises(ResetNeeded, match="all environments before"):
-        env.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(ValueError, match="seed must hold 2 seeds, got"):
-        env.reset(seed=[1, 2, 3])
-    env.reset(seed=1)
-    for mask in (np.zeros(2, bool), np.ones(3, bool), np.ones(2, int)):
-        with pytest.raises(ValueError, match="reset_mask must be"):
-            env.reset(options={"reset_mask": mask})
-    env.step(np.zeros((2, 3)))
-    with pytest.raises(ResetNeeded, match="reset_mask"):
-        env.step(np.zeros((2, 3)))
 
 
 def test_a_hall_keeps_its_obstacles_and_its_problems_are_not_mirrored():

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bounds, estimators, motion
 from rbl_gym.measurements.ranging import LinkNoise
@@ -21,8 +20,6 @@ from rbl_gym.wrappers.tasks import MobileAnchorsEnv, MobileAnchorsVectorEnv
 from tests.helpers import assert_same, score_by_hand, share_by_hand
 from tests.side_by_side import (
     actions_of,
-    assert_steps_alike,
-    peer_of,
 )
 
 MOBILE, SELECTION = "rbl_gym:RBL/MobileAnchors-v0", "rbl_gym:RBL/AnchorSelection-v0"
@@ -57,32 +54,6 @@ def run(env, n, seed=0):
     """Everything that n steps of a vector environment return."""
     rng = np.random.default_rng(seed)
     return [env.reset(seed=seed), *(env.step(actions_of(env, rng)) for _ in range(n))]
-
-
-# --- Gymnasium --------------------------------------------------------------------------------
-
-
-@every_world
-def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
-    env_id, arguments = WORLDS[kind]
-    steps = 100 if env_id == MOBILE else 50
-    world: Any = gym.make(env_id, **arguments).unwrapped
-    assert world.scene.steps == steps
-    if kind not in ("easy", "top 3"):
-        steps, arguments = 8, short(kind, 8)[2]
-    env = gym.make(env_id, **arguments).unwrapped
-    env.action_space.seed(1)
-    env.reset(seed=1)
-    for k in range(1, steps + 1):
-        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-        assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
-        assert env.observation_space.contains(observation)
-        assert math.isfinite(reward)
-        assert info["epoch"] == k
-        assert terminated is False
-        assert truncated is (k == steps)
-    with pytest.raises(ResetNeeded):
-        env.step(env.action_space.sample())
 
 
 # --- the belief by a separate filter ----------------------------------------------------------
@@ -290,14 +261,6 @@ def test_any_filter_by_a_plain_loop(env_id, filter, options):
         np.testing.assert_allclose(info["position_error_m"], np.linalg.norm(error), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["kf", "iekf-bank", "iekf-bias"])
-def test_other_filters_equal_scalar_environments(name):
-    arguments = {"filter": name, "scene": {"name": "hall", "steps": 4}, "k": 5}
-    native = AnchorSelectionVectorEnv(2, **arguments)
-    peer = peer_of(AnchorSelectionEnv, AutoresetMode.NEXT_STEP, 2, arguments)
-    assert_steps_alike(native, peer, 6, 3, TOLERANCE)
-
-
 # --- actions ----------------------------------------------------------------------------------
 
 
@@ -452,15 +415,11 @@ def test_other_scenes_give_finite_observations(kind, scene):
         (0, {"difficulty": "x"}, "difficulty must be one of 'easy', 'hard', got 'x'"),
         (0, {"difficulty": ["easy"]}, "difficulty must be one of"),
         (0, {"scene": "mars"}, "scene must be one of"),
-        (0, {"scene": 3}, "scene must be a name or a dict"),
-        (0, {"scene": ["auv_craft"]}, "scene must be a name or a dict"),
-        (0, {"scene": {"steps": 3}}, "scene must be a name or a dict"),
         (
             0,
             {"scene": {"name": "auv_craft", "anchor_speed_m_s": 0}},
             "scene must have moving anchors",
         ),
-        (0, {"scene": {"name": "auv_craft", "colour": 1}}, "scene has no field 'colour'"),
         (0, {"sort_craft": "no"}, "sort_craft must be True or False, got 'no'"),
         (0, {"render_mode": "human"}, "render_mode must be None"),
         (1, {"mode": "all"}, "mode must be one of 'top-k', 'priced', 'subset', got 'all'"),
@@ -479,22 +438,6 @@ def test_bad_arguments_are_named(kind, arguments, message):
     for cls in list(CLASSES.values())[kind]:
         with pytest.raises(ValueError, match=message):
             cls(**arguments)
-
-
-@pytest.mark.parametrize("kind", [MobileAnchorsVectorEnv, AnchorSelectionVectorEnv])
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
-        ({"max_episode_steps": 0}, "max_episode_steps must be a positive int, got 0"),
-        ({"max_episode_steps": 2.5}, "max_episode_steps must be a positive int, got 2.5"),
-        ({"max_episode_steps": "ten"}, "max_episode_steps must be a positive int, got 'ten'"),
-        ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),
-    ],
-)
-def test_bad_vector_arguments_are_named(kind, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        kind(**{"num_envs": 2, **arguments})
 
 
 @pytest.mark.parametrize(

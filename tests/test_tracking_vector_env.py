@@ -52,11 +52,13 @@ def test_disabled_refuses_to_step_past_the_end():
     ("arguments", "message"),
     [
         ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
+        ({"num_envs": 2.0}, "num_envs must be an int from 1 to 100000000, got 2.0"),
         ({"scene": "attic"}, "scene must be one of"),
         ({"reward": "gold"}, "reward must be one of 'bound', 'none', got 'gold'"),
         ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),
         ({"render_mode": "human"}, "render_mode must be None"),
         ({"max_episode_steps": 0}, "max_episode_steps must be"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps must be a positive int, got 2.5"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
@@ -68,14 +70,17 @@ def test_bad_calls_are_named():
     env = TrackingVectorEnv(2, "auv_buoys")
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros((2, 12)))
+    with pytest.raises(gym.error.ResetNeeded, match="all environments before"):
+        env.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(ValueError, match="seed must hold 2 seeds, got"):
         env.reset(seed=[1, 2, 3])
     env.reset(seed=1)
     for bad in (np.zeros((2, 11)), np.zeros((1, 2, 12)), np.full((2, 12), np.nan)):
         with pytest.raises(ValueError, match="actions must"):
             env.step(bad)
-    with pytest.raises(ValueError, match="reset_mask must be"):
-        env.reset(options={"reset_mask": np.zeros(2, bool)})
+    for mask in (np.zeros(2, bool), np.ones(3, bool), np.ones(2, int)):
+        with pytest.raises(ValueError, match="reset_mask must be"):
+            env.reset(options={"reset_mask": mask})
     fixed = TrackingVectorEnv(2, "uwb_room")
     fixed.reset(seed=1)
     with pytest.raises(ValueError, match="actions must lie in"):
