@@ -22,6 +22,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.filter import Filter
 from rbl_gym.estimators.inputs import check_epoch, check_offset_epoch, check_variance
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.direction_bias import direction_bias
 from rbl_gym.measurements.ranging import NoiseLaw
@@ -124,26 +125,18 @@ def innovations(
         common = offsets.median(grid, links.reshape(shape), offset)
         residual = (grid - common).reshape(flat)
     moved = np.concatenate([rotations.error(new[0], pose[0]), new[1] - pose[1], y - x], axis=-1)
-    H = np.swapaxes(H, -1, -2)
-    H = np.concatenate([H, np.broadcast_to(S, (*H.shape[:-1], S.shape[-1]))], axis=-1)
-    v = residual + (H @ moved[..., None])[..., 0]
     used: BoolArray = np.asarray(links & (residual**2 <= GATE**2 * variance))
-    # A = R^-1/2 H of the ranges used: cov(v) = R^1/2 (I + A P A^T) R^1/2.
-    scale = np.where(links, 1 / np.sqrt(variance), 0.0)
-    A = H * scale[..., None]
-    own = ((A @ P) * A).sum(axis=-1)
-    sound: BoolArray = np.isfinite(own).all(axis=-1) & np.isfinite(residual).all(axis=-1)
-    A = np.where((used & sound[..., None])[..., None], A, 0.0)
-    P = np.where(sound[..., None, None], P, 0.0)
-    u = np.where(used & sound[..., None], v * scale, 0.0)[..., None]
-    white, sign, log_det = _divided(u, A, P)
-    sound = sound & (sign > 0)
-    nis = (u * white).sum(axis=(-2, -1))
+    H = np.swapaxes(H, -1, -2)
+    v, own, nis, log_det, sound = whitened(H, S, P, moved, residual, variance, links, used)
     log_det = log_det + np.where(used, np.log(variance), 0.0).sum(axis=-1)
     dof = used.sum(axis=-1)
     refused = links.sum(axis=-1) - dof
     if offset is not None:
-        U = offsets.columns(offset, *shape[-2:]) * np.where(used, scale, 0.0)[..., None]
+        counts = (used & sound[..., None])[..., None]
+        scale = np.where(counts, 1 / np.sqrt(variance)[..., None], 0.0)
+        A, P = np.where(counts, _joint(H, S) * scale, 0.0), np.where(sound[..., None, None], P, 0.0)
+        U = offsets.columns(offset, *shape[-2:]) * scale
+        white = _divided(np.where(counts, v[..., None] * scale, 0.0), A, P)[0]
         total = np.swapaxes(U, -1, -2) @ _divided(U, A, P)[0]
         empty = np.diagonal(total, axis1=-2, axis2=-1) == 0
         total = total + empty[..., None] * np.eye(U.shape[-1])
@@ -165,6 +158,54 @@ def innovations(
         dof,
         np.where(sound, likelihood, -np.inf),
     )
+
+
+@compiled("innovation:whiten")
+def whitened(
+    jacobian: FloatArray,
+    slope: FloatArray,
+    covariance: FloatArray,
+    moved: FloatArray,
+    residual: FloatArray,
+    variance: FloatArray,
+    links: BoolArray,
+    used: BoolArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return the innovations of L ranges and the statistic of those used.
+
+    Parameters
+    ----------
+    jacobian, slope
+        Derivatives H (..., L, 6) and S (L, K) by pose and other states.
+    covariance, moved
+        P (..., 6 + K, 6 + K) before the update, and the changes (..., 6 + K) by it.
+    residual, variance
+        (..., L) after the update, and of the ranges.
+    links, used
+        (..., L).
+
+    Returns
+    -------
+    v (..., L); the diagonal (..., L) of ``A P A^T`` with ``A = R^-1/2 [H S]``; the NIS (...) and
+    ``log det(I + A P A^T)`` (...) of the used ranges; whether (...) they are finite.
+    """
+    H, P = _joint(jacobian, slope), covariance
+    v = residual + (H @ moved[..., None])[..., 0]
+    scale = np.where(links, 1 / np.sqrt(variance), 0.0)
+    A = H * scale[..., None]
+    own = ((A @ P) * A).sum(axis=-1)
+    sound = np.isfinite(own).all(axis=-1) & np.isfinite(residual).all(axis=-1)
+    A = np.where((used & sound[..., None])[..., None], A, 0.0)
+    P = np.where(sound[..., None, None], P, 0.0)
+    u = np.where(used & sound[..., None], v * scale, 0.0)[..., None]
+    white, sign, log_det = _divided(u, A, P)
+    return v, own, (u * white).sum(axis=(-2, -1)), log_det, sound & (sign > 0)
+
+
+def _joint(jacobian: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return the derivatives (..., L, 6 + K) by pose and other states."""
+    slope = np.broadcast_to(slope, (*jacobian.shape[:-1], slope.shape[-1]))
+    return np.concatenate([jacobian, slope], axis=-1)
 
 
 def _divided(

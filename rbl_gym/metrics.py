@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray, all_finite, checked, kernel
@@ -120,7 +120,7 @@ def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) ->
         l2, l1 = np.moveaxis(np.linalg.eigvalsh(block), -1, 0)
         l1, l2 = np.maximum(l1, 0.0), np.maximum(l2, 0.0)  # rounding, where one axis is still
         ratio = l2 / np.where(l1 > 0, l1, 1.0)
-        lengths.append(np.sqrt(2 * l1 / np.pi) * special.ellipe(1 - ratio))
+        lengths.append(np.sqrt(2 * l1 / np.pi) * scipy.special.ellipe(1 - ratio))
     return np.mean(lengths, axis=0)
 
 

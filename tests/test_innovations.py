@@ -7,7 +7,13 @@ import pytest
 from scipy import stats
 
 from rbl_gym import estimators, motion
-from rbl_gym.estimators.innovation import GATE, OUTLIER_DENSITY, OUTLIER_SHARE, innovations
+from rbl_gym.estimators.innovation import (
+    GATE,
+    OUTLIER_DENSITY,
+    OUTLIER_SHARE,
+    innovations,
+    whitened,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from tests.helpers import random_world
@@ -113,3 +119,31 @@ def test_a_state_that_is_not_finite_has_no_likelihood():
     found = innovations(filter, before, lost, ranges, anchors, tags, NOISE)
     assert np.isfinite(found.nis).tolist() == [True, False]
     assert found.nis[1] == -found.log_likelihood[1] == np.inf
+
+
+@pytest.mark.parametrize(("links", "states"), [(24, 24), (12, 0), (8, 54), (1, 0), (60, 3)])
+def test_the_kernel_of_the_statistic_equals_its_textbook_form(links, states):
+    rng = np.random.default_rng(links + states)
+    trials, size = 6, 6 + states
+    jacobian = rng.standard_normal((trials, links, 6))
+    slope = np.where(rng.random((links, states)) < 0.2, 1.0, 0.0)
+    # A direction without variance, as with known heights.
+    root = rng.standard_normal((trials, size, size - 1))
+    covariance = root @ root.swapaxes(1, 2)
+    moved = 0.01 * rng.standard_normal((trials, size))
+    residual = 0.1 * rng.standard_normal((trials, links))
+    variance = rng.uniform(0.01, 0.1, (trials, links))
+    measured = rng.random((trials, links)) < 0.8
+    used = measured & (rng.random((trials, links)) < 0.9)
+    covariance[4, 0, 0] = residual[5, 0] = np.nan
+    used[3] = False
+    epoch = jacobian, slope, covariance, moved, residual, variance, measured, used
+    found = whitened(*epoch)
+    with np.errstate(invalid="ignore"):
+        want = whitened.textbook(*epoch)
+    np.testing.assert_array_equal(found[-1], want[-1])
+    np.testing.assert_array_equal(found[-1][:4], True)
+    assert not found[-1][5]
+    sound = found[-1]
+    for one, other in zip(found[:-1], want[:-1], strict=True):
+        np.testing.assert_allclose(one[sound], other[sound], rtol=1e-9, atol=1e-9)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import special
 
 from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
@@ -159,7 +159,7 @@ class HeadingBank:
         epoch = measured, places, pose.tags
         told = innovations(self.filter, before, after, *epoch, law, mask)
         weights = state.log_weights + told.log_likelihood
-        evidence = state.log_evidence + np.asarray(special.logsumexp(weights, axis=-1))
+        evidence = state.log_evidence + np.asarray(scipy.special.logsumexp(weights, axis=-1))
         if pose.robust == "late":
             # Use the robust weights of the update, so that a late range does not select a heading.
             residual, there = told.residual / std, told.residual != 0

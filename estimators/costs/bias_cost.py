@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, kernel
@@ -60,11 +59,13 @@ class AugmentedState(NamedTuple):
 
 def extended(state: AugmentedState, *blocks: FloatArray) -> AugmentedState:
     """Return the state with further extra states of zero; a covariance (n, n) for each block."""
-    more, n = np.asarray(block_diag(*blocks)), state.covariance.shape[-1]
-    batch, total = state.extra.shape[:-1], n + len(more)
-    P = np.zeros((*batch, total, total))
-    P[..., :n, :n], P[..., n:, n:] = state.covariance, more
-    extra = np.concatenate([state.extra, np.zeros((*batch, len(more)))], axis=-1)
+    n = state.covariance.shape[-1]
+    batch, ends = state.extra.shape[:-1], np.cumsum([n, *map(len, blocks)])
+    P = np.zeros((*batch, ends[-1], ends[-1]))
+    P[..., :n, :n] = state.covariance
+    for block, end in zip(blocks, ends[1:], strict=True):
+        P[..., end - len(block) : end, end - len(block) : end] = block
+    extra = np.concatenate([state.extra, np.zeros((*batch, ends[-1] - n))], axis=-1)
     return state._replace(extra=extra, covariance=P)
 
 

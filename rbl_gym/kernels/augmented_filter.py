@@ -176,16 +176,22 @@ def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any,
             else:
                 total = information[i, j]
             A[i, j] = total
+    # One pass over a row of W for all seven sums, which the processor adds at the same time.
     for k in range(nu.shape[0]):
-        pull = 0.0
+        pull = a = b = c = x = y = z = 0.0
         for m in range(nu.shape[0]):
-            pull += W[k, m] * nu[m]
+            weight = W[k, m]
+            pull += weight * nu[m]
+            a += weight * H[m, 0]
+            b += weight * H[m, 1]
+            c += weight * H[m, 2]
+            x += weight * H[m, 3]
+            y += weight * H[m, 4]
+            z += weight * H[m, 5]
         cost += 0.5 * nu[k] * pull
         for i in range(6):
             g[i] -= H[k, i] * pull
-            of_row = 0.0
-            for m in range(nu.shape[0]):
-                of_row += W[k, m] * H[m, i]
+            of_row = (a, b, c, x, y, z)[i]
             for j in range(i, 6):
                 A[j, i] += H[k, j] * of_row
     return cost
@@ -338,60 +344,67 @@ def update(
     invert_factored6(L6, pose)
     if not sound:
         fill(math.nan, pose)
-    # Of the extra states: information of the ranges given the pose, then that of the pose.
+    # Of the extra states: information of the ranges given the pose, then that of the pose. The
+    # innermost loops run over columns of one row, which the compiler makes vector operations.
     K = size - 6
-    wide = np.empty((K, 2 * count + 12))
-    told_by, gain = wide[:, :count], wide[:, count : 2 * count]
-    by_pose, moved = wide[:, 2 * count : 2 * count + 6], wide[:, 2 * count + 6 :]
+    narrow = np.empty((4, 6, K))
+    with_pose, by_pose, moved, new = narrow[0], narrow[1], narrow[2], narrow[3]
+    told_by, gain = np.empty((count, K)), np.empty((count, K))
+    line = np.empty(K)
     for i in range(K):
+        for j in range(6):
+            with_pose[j, i] = P0[6 + i, j]
         for j in range(6):
             total = 0.0
             for m in range(6):
-                total += P0[6 + i, m] * information[m, j]
-            by_pose[i, j] = total
+                total += with_pose[m, i] * information[m, j]
+            by_pose[j, i] = total
         for k in range(count):
             total = 0.0
             for b in range(n_laws):
                 total += P0[6 + i, first + b * n_links + chosen[k]]
             for j in range(6):
-                total -= by_pose[i, j] * of_pose[k, j]
-            told_by[i, k] = total
+                total -= by_pose[j, i] * of_pose[k, j]
+            told_by[k, i] = total
+            gain[k, i] = 0.0
+    for k in range(count):
+        for m in range(count):
+            weight = W[m, k]
+            for i in range(K):
+                gain[k, i] += told_by[m, i] * weight
+    for i in range(K):
+        value = extra0[i]
+        for j in range(6):
+            value += by_pose[j, i] * e[j]
+        for k in range(count):
+            value += gain[k, i] * nu[k]
+        extra[i] = value
+        for j in range(6):
+            total = by_pose[j, i]
+            if j < 3:
+                total = by_pose[0, i] * D[0, j] + by_pose[1, i] * D[1, j] + by_pose[2, i] * D[2, j]
+            for k in range(count):
+                total -= gain[k, i] * H[k, j]
+            moved[j, i] = total
+        for j in range(6):
+            total = 0.0
+            for m in range(6):
+                total += moved[m, i] * pose[m, j]
+            new[j, i] = P[6 + i, j] = P[j, 6 + i] = total
     for i in range(6):
         for j in range(6):
             P[i, j] = pose[i, j]
     for i in range(K):
-        for k in range(count):
-            total = 0.0
-            for m in range(count):
-                total += told_by[i, m] * W[m, k]
-            gain[i, k] = total
-        value = extra0[i]
-        for j in range(6):
-            value += by_pose[i, j] * e[j]
-        for k in range(count):
-            value += gain[i, k] * nu[k]
-        extra[i] = value
-        x, y, z = by_pose[i, 0], by_pose[i, 1], by_pose[i, 2]
-        for j in range(6):
-            total = by_pose[i, j]
-            if j < 3:
-                total = x * D[0, j] + y * D[1, j] + z * D[2, j]
-            for k in range(count):
-                total -= gain[i, k] * H[k, j]
-            moved[i, j] = total
-        for j in range(6):
-            total = 0.0
-            for m in range(6):
-                total += moved[i, m] * pose[m, j]
-            P[6 + i, j] = total
-            P[j, 6 + i] = total
-    for i in range(K):
         for j in range(i + 1):
-            total = P0[6 + i, 6 + j]
-            for m in range(6):
-                total -= by_pose[i, m] * P0[6 + j, m]
-                total += P[6 + i, m] * moved[j, m]
-            for k in range(count):
-                total -= gain[i, k] * told_by[j, k]
-            P[6 + i, 6 + j] = total
-            P[6 + j, 6 + i] = total
+            line[j] = P0[6 + i, 6 + j]
+        for m in range(6):
+            a, b = by_pose[m, i], new[m, i]
+            for j in range(i + 1):
+                line[j] -= a * with_pose[m, j]
+                line[j] += b * moved[m, j]
+        for k in range(count):
+            a = gain[k, i]
+            for j in range(i + 1):
+                line[j] -= a * told_by[k, j]
+        for j in range(i + 1):
+            P[6 + i, 6 + j] = P[6 + j, 6 + i] = line[j]

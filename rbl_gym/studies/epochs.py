@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import special
 
 from rbl_gym import metrics
 from rbl_gym.checks import BoolArray, FloatArray
@@ -353,5 +353,5 @@ def nees_interval(count: int = 1, dof: int = 6, level: float = 0.95) -> tuple[fl
         Probability; half of the remainder lies below, half above.
     """
     tail = 0.5 * (1 - level)
-    low, high = (special.chdtri(dof * count, p) / count for p in (1 - tail, tail))
+    low, high = (scipy.special.chdtri(dof * count, p) / count for p in (1 - tail, tail))
     return float(low), float(high)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Innovations
@@ -78,10 +78,12 @@ def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatA
 
 
 def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> BoolArray:
-    by_chance = special.chdtri(np.maximum(dof, 1), _CHANCE)
     lost = refused > MOST_REFUSED * (dof + refused)
     # A single wrong range among five is not reported.
-    return (nis > np.maximum(MOST_NIS * dof, by_chance)) | (lost & (refused > _BLOCKS))
+    high = nis > MOST_NIS * dof
+    if high.any():
+        high &= nis > scipy.special.chdtri(np.maximum(dof, 1), _CHANCE)
+    return high | (lost & (refused > _BLOCKS))
 
 
 def residual_tables(found: Innovations, recording: Recording) -> dict[str, list[dict[str, Any]]]:
@@ -139,5 +141,5 @@ def nis_curve(
     when = when / np.diff(starts, append=len(times))
     some = dof > 0
     when, nis, dof = when[some], nis[some], dof[some]
-    low, high = (special.chdtri(dof, p) / dof for p in (0.975, 0.025))
+    low, high = (scipy.special.chdtri(dof, p) / dof for p in (0.975, 0.025))
     return when, nis / dof, low, high
