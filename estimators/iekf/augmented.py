@@ -194,7 +194,8 @@ class AugmentedEkf:
                 start, covariance = found[:2], found.covariance[..., :6, :6]
             count = ranges.shape[-2] * ranges.shape[-1]
             found = undirected(found, count)  # pyright: ignore
-        as_state(*found[:2], found.covariance)
+        # A row suffices: all of them are NaN if the pose is not determined.
+        as_state(*found[:2], found.covariance[..., 0, :])
         return found
 
     def _updated(

@@ -32,8 +32,10 @@ def is_vague(covariance: FloatArray) -> BoolArray:
     """Return whether (...) the largest variance of the rotation exceeds `VAGUE_ROTATION_RAD`^2."""
     limit = VAGUE_ROTATION_RAD**2
     # The trace bounds the largest eigenvalue, which suffices for most priors.
-    if covariance.ndim == 2 and not sum(covariance.item(i, i) for i in range(3)) > limit:
-        return np.asarray(False)
+    if covariance.ndim == 2:
+        trace = covariance.item(0, 0) + covariance.item(1, 1) + covariance.item(2, 2)
+        if not trace > limit:
+            return np.asarray(False)
     vague = np.asarray(
         covariance[..., 0, 0] + covariance[..., 1, 1] + covariance[..., 2, 2] > limit
     )

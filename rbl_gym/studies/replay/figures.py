@@ -16,7 +16,6 @@ from rbl_gym.studies.replay.judging import (
     excluded_epochs,
     in_clock,
     track_errors,
-    truth_of,
 )
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
 from rbl_gym.studies.replay.observed import known_figures
@@ -60,7 +59,7 @@ def track_figures(
     if found is None:
         return result
     result["epochs_with_truth"] = int(found.known.sum())
-    return {**result, **_comparison(recording, track, settings), **error_figures(found)}
+    return {**result, **_comparison(recording, found, settings), **error_figures(found)}
 
 
 def smoothed_figures(smoothed: SmoothedRecording, found: TrackErrors | None) -> dict[str, Any]:
@@ -96,9 +95,9 @@ def error_figures(found: TrackErrors) -> dict[str, float]:
     return result
 
 
-def _comparison(recording: Recording, track: Track, settings: Settings) -> dict[str, Any]:
+def _comparison(recording: Recording, found: TrackErrors, settings: Settings) -> dict[str, Any]:
     """Return how track and truth were matched."""
-    truth = truth_of(recording, track, settings)
+    truth = found.reference
     assert truth is not None
     assert recording.truth is not None
     result: dict[str, Any] = {
@@ -161,7 +160,7 @@ def _notes(
         if _truth_at_mirror(recording, track, found, settings):
             notes.append("Note: the truth is at the mirror pose.")
         else:
-            notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, settings)]
+            notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, found, settings)]
     return {**result, "notes": notes}
 
 
@@ -194,8 +193,10 @@ def _mirror_note(found: dict[str, Any], count: int) -> str:
     )
 
 
-def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list[str]:
-    reference = truth_of(recording, track, settings)
+def _fault_hints(
+    recording: Recording, track: Track, found: TrackErrors, settings: Settings
+) -> list[str]:
+    reference = found.reference
     assert reference is not None
     assert recording.truth is not None
     truth = in_clock(recording.truth, settings)

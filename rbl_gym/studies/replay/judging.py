@@ -89,6 +89,8 @@ class TrackErrors(NamedTuple):
         Distance (K,) of the tag centre, metres, and angle (K,) of the tag line, radians, for
         collinear tags, for which ranges determine no more. None for other bodies; the angle is
         also None for a single tag.
+    reference
+        The truth at the epochs of the track; None for several runs together.
     """
 
     known: BoolArray
@@ -100,6 +102,7 @@ class TrackErrors(NamedTuple):
     freedom: int
     centre: FloatArray | None = None
     axis: FloatArray | None = None
+    reference: Reference | None = None
 
 
 def find_offset(recording: Recording, track: Track, settings: Settings) -> TimeOffset | None:
@@ -259,6 +262,7 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
         len(axes),
         centre,
         axis,
+        truth,
     )
 
 

@@ -119,19 +119,17 @@ def replay_recording(
 
 
 class _Stopwatch:
-    """Measure the processor time from one epoch to the next, without `advance`."""
+    """Measure the processor time from one epoch to the next."""
 
     def __init__(self, advance: Callable[[], None]) -> None:
         self._advance = advance
-        self._spent: list[float] = []
-        self._start = time.process_time()
+        self._ends = [time.process_time()]
 
     def tick(self) -> None:
         """Note the end of an epoch."""
-        self._spent.append(time.process_time() - self._start)
+        self._ends.append(time.process_time())
         self._advance()
-        self._start = time.process_time()
 
     def microseconds(self) -> float:
         """Return the median time of an epoch; the first ones may include compilation."""
-        return 1e6 * float(np.median(self._spent))
+        return 1e6 * float(np.median(np.diff(self._ends)))

@@ -22,9 +22,9 @@ _LARGE, _EXPLAINED = 0.5, 0.25
 _MOST_EXPLAINED, _HUGE = 0.1, 4.0
 # The first listed fault is preferred unless another one leaves fewer errors by this factor.
 _AS_GOOD = 1.5
-# Fewest poses that determine a fault, and the tested time shifts (s).
+# Fewest poses that determine a fault; the tested time shifts (s), then those around the best.
 _FEWEST = 4
-_SHIFTS = np.linspace(-3.0, 3.0, 121)
+_SHIFTS, _FINE_SHIFTS = np.linspace(-3.0, 3.0, 31), np.linspace(-0.15, 0.15, 7)
 _SI = ((1e-3, "milli", "ms"), (1e-6, "micro", "us"), (1e-9, "nano", "ns"))
 
 
@@ -248,20 +248,21 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
 
 def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
     """Yield the time shift with the smallest position errors, if it is not about zero."""
-    best: tuple[float, float] | None = None
-    for shift in _SHIFTS:
+
+    def left(shift: float) -> float:
         other = at(shift, False)
         if len(other.times) < _FEWEST:
-            continue
+            return np.inf
         place = ((other.translation - other.true_translation) ** 2).sum(axis=-1)
-        left = float((place / other.place_variance).mean())
-        if best is None or left < best[0]:
-            best = left, shift
-    if best is not None and abs(best[1]) > 0.01:
-        side = "late" if best[1] > 0 else "early (or the filter lags: see --walk-m)"
+        return float((place / other.place_variance).mean())
+
+    best = min(_SHIFTS, key=left)
+    best = min(best + _FINE_SHIFTS, key=left)
+    if abs(best) > 0.01:
+        side = "late" if best > 0 else "early (or the filter lags: see --walk-m)"
         yield (
-            f"the truth's stamps look about {abs(best[1]):.2f} s {side}; see --time-offset",
-            at(best[1], True),
+            f"the truth's stamps look about {abs(best):.2f} s {side}; see --time-offset",
+            at(best, True),
         )
 
 
