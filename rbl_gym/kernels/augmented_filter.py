@@ -16,7 +16,6 @@ from rbl_gym.kernels.linear_algebra import (
     cholesky,
     cholesky6,
     fill,
-    invert_factored,
     invert_factored6,
     solve_factored6,
 )
@@ -150,8 +149,31 @@ def innovation(
 
 
 @helper
-def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any, A: Any) -> float:
-    """Return the cost at a pose; write its gradient and lower half of the Hessian to g and A."""
+def whiten(L: Any, nu: Any, H: Any, y: Any, B: Any) -> None:
+    """Compute ``y = L^-1 nu`` and ``B = L^-1 H`` for seven right sides at the same time."""
+    for k in range(nu.shape[0]):
+        r, a, b, c, d, e, f = nu[k], H[k, 0], H[k, 1], H[k, 2], H[k, 3], H[k, 4], H[k, 5]
+        for m in range(k):
+            factor = L[k, m]
+            r -= factor * y[m]
+            a -= factor * B[m, 0]
+            b -= factor * B[m, 1]
+            c -= factor * B[m, 2]
+            d -= factor * B[m, 3]
+            e -= factor * B[m, 4]
+            f -= factor * B[m, 5]
+        scale = L[k, k]
+        y[k] = r * scale
+        B[k, 0], B[k, 1], B[k, 2] = a * scale, b * scale, c * scale
+        B[k, 3], B[k, 4], B[k, 5] = d * scale, e * scale, f * scale
+
+
+@helper
+def linearize(e: Any, D: Any, white: Any, B: Any, information: Any, g: Any, A: Any) -> float:
+    """Return the cost at a pose; write its gradient and lower half of the Hessian to g and A.
+
+    `white` and B are the whitened innovations and their derivatives.
+    """
     cost = 0.0
     for i in range(6):
         pull = 0.0
@@ -176,37 +198,23 @@ def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any,
             else:
                 total = information[i, j]
             A[i, j] = total
-    # One pass over a row of W for all seven sums, which the processor adds at the same time.
-    for k in range(nu.shape[0]):
-        pull = a = b = c = x = y = z = 0.0
-        for m in range(nu.shape[0]):
-            weight = W[k, m]
-            pull += weight * nu[m]
-            a += weight * H[m, 0]
-            b += weight * H[m, 1]
-            c += weight * H[m, 2]
-            x += weight * H[m, 3]
-            y += weight * H[m, 4]
-            z += weight * H[m, 5]
-        cost += 0.5 * nu[k] * pull
+    for k in range(white.shape[0]):
+        cost += 0.5 * white[k] * white[k]
         for i in range(6):
-            g[i] -= H[k, i] * pull
-            of_row = (a, b, c, x, y, z)[i]
-            for j in range(i, 6):
-                A[j, i] += H[k, j] * of_row
+            g[i] -= B[k, i] * white[k]
+            for j in range(i + 1):
+                A[i, j] += B[k, i] * B[k, j]
     return cost
 
 
 @helper
-def weigh(own: Any, variance: Any, share: Any, L: Any, W: Any) -> bool:
-    """Compute ``W = (own + R)^-1`` with variances R of the links, divided by their shares."""
+def weigh(own: Any, variance: Any, share: Any, L: Any) -> bool:
+    """Factor ``L L^T = own + R`` with variances R of the links, divided by their shares."""
     for i in range(own.shape[0]):
         for j in range(i + 1):
             L[i, j] = own[i, j]
         L[i, i] = (own[i, i] + variance[i]) / share[i]
-    good = cholesky(L, L)
-    invert_factored(L, W)
-    return good
+    return cholesky(L, L)
 
 
 @helper
@@ -253,11 +261,10 @@ def update(
     D, turn, new_Q = small[0], small[1], small[2]
     new_t = np.empty(3)
     rows = np.empty((4, count, 6))
-    of_pose, slope, H, new_H = rows[0], rows[1], rows[2], rows[3]
-    squares = np.empty((3, count, count))
-    own, W, L = squares[0], squares[1], squares[2]
+    of_pose, slope, H, B = rows[0], rows[1], rows[2], rows[3]
+    own, L = np.empty((count, count)), np.empty((count, count))
     values = np.empty((5, count))
-    told, variance, share, nu, new_nu = values[0], values[1], values[2], values[3], values[4]
+    told, variance, share, nu, y = values[0], values[1], values[2], values[3], values[4]
     for i in range(6):
         for j in range(6):
             A[i, j] = P0[i, j]
@@ -301,15 +308,14 @@ def update(
                 break
         elif again:
             break
-        sound = weigh(own, variance, share, L, W) and sound
+        sound = weigh(own, variance, share, L) and sound
         # Damped Gauss-Newton as in `pose_solver.solve`.
         cost, decrease, damping = 0.0, 0.0, 0.0
         copy_pose(Q, t, new_Q, new_t)
         for k in range(iterations + 1):
-            innovation(
-                new_Q, new_t, Q0, t0, told, slope, chosen, anchors, tags, e, D, new_nu, new_H
-            )
-            new = linearize(e, D, new_nu, new_H, W, information, new_g, A)
+            innovation(new_Q, new_t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
+            whiten(L, nu, H, y, B)
+            new = linearize(e, D, y, B, information, new_g, A)
             if k == 0 or new <= cost * (1 + 1e-12) or decrease < 1e-8:
                 cost = new
                 damping = 0.1 * damping if damping > 1e-5 else 0.0
@@ -338,6 +344,7 @@ def update(
             for i in range(3):
                 new_t[i] = t[i] + step[3 + i]
     innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
+    whiten(L, nu, H, y, B)
     mirror(best)
     keep_wide(Q0, information, Q, weights, tags, best)
     sound = cholesky6(best, L6) and sound
@@ -349,8 +356,7 @@ def update(
     K = size - 6
     narrow = np.empty((4, 6, K))
     with_pose, by_pose, moved, new = narrow[0], narrow[1], narrow[2], narrow[3]
-    told_by, gain = np.empty((count, K)), np.empty((count, K))
-    line = np.empty(K)
+    told_by, line = np.empty((count, K)), np.empty(K)
     for i in range(K):
         for j in range(6):
             with_pose[j, i] = P0[6 + i, j]
@@ -366,25 +372,26 @@ def update(
             for j in range(6):
                 total -= by_pose[j, i] * of_pose[k, j]
             told_by[k, i] = total
-            gain[k, i] = 0.0
     for k in range(count):
-        for m in range(count):
-            weight = W[m, k]
+        for m in range(k):
+            factor = L[k, m]
             for i in range(K):
-                gain[k, i] += told_by[m, i] * weight
+                told_by[k, i] -= factor * told_by[m, i]
+        for i in range(K):
+            told_by[k, i] *= L[k, k]
     for i in range(K):
         value = extra0[i]
         for j in range(6):
             value += by_pose[j, i] * e[j]
         for k in range(count):
-            value += gain[k, i] * nu[k]
+            value += told_by[k, i] * y[k]
         extra[i] = value
         for j in range(6):
             total = by_pose[j, i]
             if j < 3:
                 total = by_pose[0, i] * D[0, j] + by_pose[1, i] * D[1, j] + by_pose[2, i] * D[2, j]
             for k in range(count):
-                total -= gain[k, i] * H[k, j]
+                total -= told_by[k, i] * B[k, j]
             moved[j, i] = total
         for j in range(6):
             total = 0.0
@@ -403,7 +410,7 @@ def update(
                 line[j] -= a * with_pose[m, j]
                 line[j] += b * moved[m, j]
         for k in range(count):
-            a = gain[k, i]
+            a = told_by[k, i]
             for j in range(i + 1):
                 line[j] -= a * told_by[k, j]
         for j in range(i + 1):
