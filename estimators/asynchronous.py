@@ -170,8 +170,8 @@ class Asynchronous:
             anchors = check_array("anchors", anchors, ("M", 3))
             if anchors.shape[-2] != len(self.anchors):
                 raise ValueError(
-                    f"anchors must have shape ({len(self.anchors)}, 3), as at the start, got "
-                    f"{anchors.shape}"
+                    f"anchors must have shape ({len(self.anchors)}, 3), the number of anchors must "
+                    f"not change; got {anchors.shape}"
                 )
         measured = TimedRange(time, anchor, tag, value, twist, noise, anchors)
         newest = max(time, stream.time)
@@ -215,7 +215,8 @@ class Asynchronous:
         time = check_number("time", time)
         if time < newest.time:
             raise ValueError(
-                f"time must not be before the newest range, at {newest.time} s, got {time} s"
+                f"time must be at least {newest.time:g} s, the time of the newest range, got "
+                f"{time:g} s"
             )
         return self._moved(
             newest, time, None if twist is None else check_array("twist", twist, (6,))

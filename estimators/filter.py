@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, imported
+from rbl_gym.checks import FloatArray, check_array, did_you_mean, imported
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
@@ -146,14 +146,21 @@ def make(
         ("process", process, ("covariance", "std")),
     ):
         if not all(callable(getattr(value, method, None)) for method in methods):
-            raise ValueError(f"{label} must have {' and '.join(methods)}, got {value!r:.80}")
+            usual = {"noise": "ranging.RangeNoise", "process": "motion.ProcessNoise"}[label]
+            raise ValueError(
+                f"{label} must be an object such as {usual}, with the methods "
+                f"{' and '.join(methods)}, got {value!r:.80}"
+            )
     parameters = inspect.signature(factory).parameters
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     laws = ("tags", "noise", "process")
     known = [key for key in parameters if key not in laws]
     unknown = [key for key in options if key in laws or not (takes_any or key in known)]
     if unknown:
-        raise ValueError(f"filter {name!r} has no option {unknown[0]!r}; it has {', '.join(known)}")
+        raise ValueError(
+            f"filter {name!r} has no option {unknown[0]!r}; its options are {', '.join(known)}"
+            f"{did_you_mean(unknown[0], known)}"
+        )
     return factory(tags=tags, noise=noise, process=process, **options)
 
 
@@ -219,6 +226,7 @@ def factory_of(name: str) -> Callable[..., Filter]:
     raise ValueError(
         f"filter must be one of {', '.join(names())}, or a name given by "
         f"rbl_gym.estimators.register, or 'module:factory', got {name!r:.80}"
+        f"{did_you_mean(name, names())}"
     )
 
 

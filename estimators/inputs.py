@@ -288,7 +288,8 @@ def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:
         getattr(noise, "squared_range_variance", None)
     ):
         raise ValueError(
-            f"noise must have variance and squared_range_variance, or be None, got {noise!r:.80}"
+            "noise must be a noise law such as ranging.RangeNoise (with variance and "
+            f"squared_range_variance), or None, got {noise!r:.80}"
         )
     return noise
 

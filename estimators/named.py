@@ -140,7 +140,8 @@ def iekf_log(
     if clock is not None:
         if odometry is not None or headings != 1 or directions is not None:
             raise ValueError(
-                f"clock must be None with odometry, headings or directions, got {clock!r:.80}"
+                "clock must be None if odometry, directions or several headings are given, got "
+                f"{clock!r:.80}"
             )
         filter = ClockEkf(pose, law, None, (stays, moves), clock=clock)
     elif odometry is None:

@@ -7,11 +7,12 @@ use the decorator `checked`; callers with checked arguments use the `kernel` wit
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -255,7 +256,8 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
     if mask.dtype != np.bool_:
         measured = mask != 0
         if mask.dtype.kind not in "iuf" or (measured != mask).any():
-            raise ValueError("links must be boolean (True: measured), got other values")
+            wrong = mask.ravel() if mask.dtype.kind not in "iuf" else mask[measured != mask]
+            raise ValueError(f"links must be True (measured) or False, got {wrong[0]!s:.80}")
         mask = measured
     return mask
 
@@ -263,8 +265,18 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
 def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) -> str:
     """Return `value` if it is among `choices`, or raise ValueError that lists them."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+        near = did_you_mean(value, choices)
+        raise ValueError(
+            f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r:.80}{near}"
+        )
     return value
+
+
+def did_you_mean(value: Any, choices: Iterable[str]) -> str:
+    """Return ``"; did you mean 'iekf'?"`` if a choice is close to `value`, else ``""``."""
+    known = {choice.lower(): choice for choice in choices}
+    near = difflib.get_close_matches(str(value).lower(), list(known), n=2, cutoff=0.7)
+    return f"; did you mean {' or '.join(repr(known[name]) for name in near)}?" if near else ""
 
 
 def imported(name: str, path: str) -> Callable[..., Any]:

@@ -89,7 +89,10 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     try:
         solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     except np.linalg.LinAlgError as mistake:
-        raise ValueError(f"covariance must not be singular, got {covariance!r:.80}") from mistake
+        rank = np.linalg.matrix_rank(covariance)
+        raise ValueError(
+            f"covariance must not be singular, got rank {rank.min()} of {error.shape[-1]}"
+        ) from mistake
     return np.einsum("...i,...i->...", error, solved)
 
 

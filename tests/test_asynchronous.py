@@ -158,7 +158,7 @@ def test_a_range_that_cannot_be_is_refused(change, message):
 def test_a_stream_that_cannot_be_is_refused():
     links, stream, rows = stream_of("iekf", np.random.default_rng(6))
     stream = links.add(stream, *rows[0])
-    with pytest.raises(ValueError, match="time must not be before the newest range"):
+    with pytest.raises(ValueError, match=r"time must be at least .* the time of the newest range"):
         links.state(stream, rows[0][0] - 0.001)
     with pytest.raises(ValueError, match=r"anchors must be \(M, 3\)"):
         Asynchronous(links.filter, np.zeros((2, 4, 3)), 4)
@@ -189,5 +189,5 @@ def test_anchors_that_move_and_a_deviation_for_every_range():
     same(links.belief(stream), links.filter.belief(state))
     with pytest.raises(ValueError, match="std_m and noise must not both"):
         links.add(stream, time, 0, 0, 1.0, noise=NOISE, std_m=0.1)
-    with pytest.raises(ValueError, match=r"anchors must have shape \(5, 3\), as at the start"):
+    with pytest.raises(ValueError, match=r"anchors must have shape \(5, 3\), the number"):
         links.add(stream, time, 0, 0, 1.0, anchors=np.zeros((4, 3)))

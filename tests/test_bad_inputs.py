@@ -85,7 +85,7 @@ def test_priors(name, changes, message):
         ),
         ({"anchors": np.zeros((0, 3))}, r"anchors must have shape \(..., M, 3\), got \(0, 3\)"),
         ({"links": np.ones((5, 4), bool)}, r"links must have shape \(..., 4, 5\), got \(5, 4\)"),
-        ({"links": np.full((4, 5), 0.5)}, "links must be boolean"),
+        ({"links": np.full((4, 5), 0.5)}, "links must be True"),
     ],
 )
 def test_epochs(name, changes, message):

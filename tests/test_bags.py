@@ -509,7 +509,7 @@ def test_clocks_that_differ_and_stamps_that_are_missing(tmp_path):
     result = recordings.convert_bag(log, tmp_path / "out", {"ranges": MINE})
     notes = " ".join(result["notes"])
     assert "imu: the messages have no stamps, so the times of recording are used" in notes
-    assert "stamps are behind the times of recording: ranges 3.000 s, imu 0.000 s" in notes
+    assert "stamps are behind the times of recording by ranges 3.000 s, imu 0.000 s" in notes
     assert read_csv(tmp_path / "out" / "imu.csv")[1]["t"] == "1700000000.000000001"
 
 
@@ -523,7 +523,10 @@ def test_one_of_several_topics_is_not_guessed(tmp_path):
     log = write_bag(tmp_path / "two", "ros1", types, messages)
     none = {"ranges": {"topic": "none"}}
     result = recordings.convert_bag(log, tmp_path / "out", none)
-    assert result["notes"] == ["imu not written, as several topics are possible: /a/imu, /b/imu"]
+    assert result["notes"] == [
+        "imu not written, as several topics are possible, /a/imu, /b/imu: name one by --imu "
+        "topic=NAME"
+    ]
     result = recordings.convert_bag(log, tmp_path / "out", {**none, "imu": {"topic": "/b/*"}})
     assert result["kinds"]["imu"]["topics"] == ["/b/imu"]
     with pytest.raises(ValueError, match=r"imu\.csv exists and does not come from this log"):
@@ -586,7 +589,10 @@ def test_topics_and_fields_are_listed(small, capsys):
             {"ranges": {"topic": "/uwb"}},
             "my_uwb/msg/Range: give the field paths of anchor, tag, range",
         ),
-        ({"ranges": {**MINE, "topic": "/x"}}, r"no topic '/x', the topics are /uwb"),
+        (
+            {"ranges": {**MINE, "topic": "/x"}},
+            r"topic '/x', which the log does not have; its topics are",
+        ),
         (
             {"ranges": {**MINE, "range": "dist"}},
             r"topic /uwb, \[ranges\]: no field 'dist', there is header, here, there, range_mm",
@@ -598,15 +604,18 @@ def test_topics_and_fields_are_listed(small, capsys):
         ({"ranges": {**MINE, "unit": "ft"}}, "unit must be one of .* got 'ft'"),
         ({"ranges": {**MINE, "time_unit": "min"}}, "time_unit must be one of .* got 'min'"),
         ({"ranges": {**MINE, "time": "header.frame_id"}}, "time must be a stamp or a number"),
-        ({"ranges": {**MINE, "anchors": "x"}}, r"\[ranges\] unknown key 'anchors'"),
-        ({"range": MINE}, r"unknown table \[range\]"),
+        (
+            {"ranges": {**MINE, "anchors": "x"}},
+            r"\[ranges\] has an unknown key .*did you mean 'anchor'",
+        ),
+        ({"range": MINE}, r"table \[range\] is unknown.*did you mean 'ranges'"),
         (
             {"ranges": MINE, "truth": {"topic": "/uwb", "position": "header.stamp"}},
             "position must be x, y, z, got",
         ),
         (
             {"ranges": MINE, "truth": {"topic": "/uwb", "position": "here", "child": "b"}},
-            "child: messages of type my_uwb/msg/Range have no such frame",
+            "must not have the key child, as messages of type my_uwb/msg/Range",
         ),
     ],
 )

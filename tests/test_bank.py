@@ -267,9 +267,9 @@ def test_an_epoch_without_links_changes_nothing_but_the_window():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"volume": [[0, 0, 0], [1, -1, 1]]}, "volume must be a lower and an upper corner"),
+        ({"volume": [[0, 0, 0], [1, -1, 1]]}, r"volume must be \[lower corner, upper"),
         ({"volume": [[0, 0], [1, 1]]}, r"volume must have shape \(..., 2, 3\)"),
-        ({"volume": np.zeros((4, 2, 3))}, "volume must be a lower and an upper corner"),
+        ({"volume": np.zeros((4, 2, 3))}, r"volume must be \[lower corner, upper"),
         ({"iterations": 0}, "iterations must be"),
         ({"robust": 1}, "robust must be True, False or 'late'"),
         ({"rivals": 3}, "filter 'iekf-bank' has no option 'rivals'"),

@@ -147,7 +147,7 @@ def test_a_drawn_episode_equals_that_of_its_scene_alone():
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must be left out with scenes"),
+        ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must be left out if scenes is given"),
         ({"scenes": ["hall"]}, r"scenes\[0\] must be a dict of changes, got 'hall'"),
         ({"scenes": []}, "scenes must hold at least one scene"),
         (

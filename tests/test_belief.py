@@ -74,10 +74,10 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
             {},
             "filter must be one of .*et-kf, .*kf-ortho, .*uc-kf.*, or a name .*got 'ekf'",
         ),
-        ("kf", {"robust": True}, "filter 'kf' has no option 'robust'; it has"),
-        ("iekf", {"threshold": 1.0}, "it has iterations, robust"),
-        ("kf", {"noise": 0.1}, "noise must have variance and squared_range_variance, got 0.1"),
-        ("kf", {"process": None}, "process must have covariance and std"),
+        ("kf", {"robust": True}, "filter 'kf' has no option 'robust'; its options are"),
+        ("iekf", {"threshold": 1.0}, "its options are iterations, robust"),
+        ("kf", {"noise": 0.1}, "noise must be .* ranging.RangeNoise, .* got 0.1"),
+        ("kf", {"process": None}, "process must be .* motion.ProcessNoise, .* got None"),
         ("iekf", {"tags": np.zeros((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
         (
             "iekf/robust",
@@ -86,7 +86,7 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
         ),
         ("iekf/robust=true/robust=late", {}, "has the option 'robust' twice"),
         ("iekf/robust=true", {"robust": True}, "has the option 'robust' twice"),
-        ("iekf/tags=3", {}, "filter 'iekf' has no option 'tags'; it has"),
+        ("iekf/tags=3", {}, "filter 'iekf' has no option 'tags'; its options are"),
         ("iekf", {"iterations": 0}, "iterations must be a positive int, got 0"),
         ("et-kf", {"threshold": -1}, "threshold must be a finite number"),
         (

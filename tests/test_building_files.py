@@ -399,7 +399,7 @@ BAD = [
     (
         "anchors.fixed",
         [[1, 1, 2]] * 9,
-        "the number of anchors includes the fixed ones: it must be at least 9",
+        "the number of anchors must be at least 9, the number of anchors.fixed",
     ),
     ("anchors.fixed", [[1, 2]], "anchors.fixed must have shape"),
     ("anchors.half_angle_deg", 200, "anchors.half_angle_deg must be a finite number in [0.1"),
@@ -507,7 +507,7 @@ def test_the_schema_refuses_what_the_reader_refuses_by_form():
     rule = schema()
     # What only geometry or other tables can tell.
     deeper = re.compile("cross or touch|different points|one of .materials|either material|lie "
-                        "below|inside an obst|includes the|from|free place|must differ|needs|"
+                        "below|inside an obst|of anchors.fixed|from|free place|must differ|needs|"
                         "no effect|at most|finite, got|1e\\+06 m|permitted|not be empty|"
                         "axis|either .region|slabs|must be given")  # fmt: skip
     checked = 0

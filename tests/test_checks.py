@@ -94,10 +94,10 @@ def test_no_links_stay_none():
     [
         (np.ones((3, 2)), "links must have shape (..., 2, 3), got (3, 2)"),
         (True, "links must have shape (..., 2, 3), got ()"),
-        (np.full((2, 3), 0.5), "links must be boolean"),
-        (np.full((2, 3), np.nan), "links must be boolean"),
-        (np.full((2, 3), 2), "links must be boolean"),
-        (np.full((2, 3), "x"), "links must be boolean"),
+        (np.full((2, 3), 0.5), "links must be True"),
+        (np.full((2, 3), np.nan), "links must be True"),
+        (np.full((2, 3), 2), "links must be True"),
+        (np.full((2, 3), "x"), "links must be True"),
     ],
 )
 def test_bad_links_are_refused(links, message):
@@ -109,3 +109,17 @@ def test_choice():
     assert checks.check_one_of("method", "ls", ("ls", "ml")) == "ls"
     with pytest.raises(ValueError, match=r"^method must be one of 'ls', 'ml', got 'svd'$"):
         checks.check_one_of("method", "svd", ("ls", "ml"))
+
+
+@pytest.mark.parametrize(
+    ("value", "hint"),
+    [
+        ("iekff", "; did you mean 'iekf'?"),
+        ("uwb", ""),
+        (None, ""),
+        (3, ""),
+        ("IEKF", "; did you mean 'iekf'?"),
+    ],
+)
+def test_a_misspelt_name_gets_a_suggestion(value, hint):
+    assert checks.did_you_mean(value, ["iekf", "uc-kf", "kf"]) == hint

@@ -368,7 +368,7 @@ def test_planar_among_anchors_at_different_heights_needs_the_tags_height(raw_fil
     said = capsys.readouterr()
     if offset is None:
         assert status == 2
-        assert "must be given, as the anchors have heights of 1 to 1.4 m" in said.err
+        assert "and the anchors are at 1 to 1.4 m" in said.err
     else:
         assert status == 0
         assert json.loads(said.out)["settings"]["height_offset_m"] == float(offset)
@@ -381,12 +381,12 @@ def test_planar_among_anchors_at_different_heights_needs_the_tags_height(raw_fil
         (["--raw", "--filter", "iekf"], "need the filter iekf-bias, got iekf"),
         (["--filter", "uc-kf", "--bias-std-m", "0.1"], "need the filter iekf-bias, got uc-kf"),
         (["--bias-std-m", "-1"], "std_m must be a finite number"),
-        (["--accel-m", "-1"], "accel_m must be a finite number"),
+        (["--accel-m", "-1"], "--accel-m must be a finite number"),
         (["--ranges", "nowhere.csv"], "nowhere.csv"),
-        (["--height-offset-m", "0.1"], "height_offset_m needs planar"),
+        (["--height-offset-m", "0.1"], "--height-offset-m needs --planar"),
         (["--filter", "magic"], "filter must be one of"),
-        (["--walk-m", "-1"], "walk_m must be a finite number"),
-        (["--range-std-m", "0"], "range_std_m must be a finite number"),
+        (["--walk-m", "-1"], "--walk-m must be a finite number"),
+        (["--range-std-m", "0"], "--range-std-m must be a finite number"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_with_status_2(files, change, message, capsys):

@@ -123,12 +123,12 @@ def test_pseudo_ranges_of_any_sign_are_read(tmp_path, offset):
         (7, 4, "nan", "difference.*must be a finite number"),
         (7, 4, "x", "difference.*must be a finite number"),
         (7, 4, "1e12", "at most 1e9 m"),
-        (7, 1, "9", "unknown anchor"),
-        (7, 2, "9", "unknown anchor"),
-        (7, 3, "9", "unknown tag"),
+        (7, 1, "9", "anchor must be one of 0, 1, 2"),
+        (7, 2, "9", "anchor must be one of 0, 1, 2"),
+        (7, 3, "9", "tag must be one of 0, 1, 2"),
         (7, 2, "3", "must be another anchor than anchor_a"),
         (7, 0, "nan", "t.*finite"),
-        (7, 0, "-5", "time must not fall"),
+        (7, 0, "-5", "time must not decrease"),
     ],
 )
 def test_bad_rows_are_refused_by_line(tmp_path, row, column, cell, message):
@@ -155,7 +155,7 @@ def test_a_pair_that_comes_twice_is_dropped_and_counted(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"anchors": None}, "differences need a table of anchors"),
+        ({"anchors": None}, "positions of the anchors .--anchors., which time diff"),
         ({"offset": "anchor"}, "offset must be None or 'tag'"),
         ({"calibration": "c.csv"}, "calibration must be left out for ranges"),
     ],

@@ -302,7 +302,7 @@ def test_derivatives_of_the_costs_by_finite_differences():
         ({"half_space": "up"}, "half_space must be"),
         ({"noise": 0.1}, "noise must be a bearing.AngleNoise"),
         ({"tags": TAGS[:2], "angles": np.ones((2, 2))}, "tags must be at least 3"),
-        ({"tags": TAGS[[0, 1, 1, 0]]}, "tags must be at least 3 and not collinear"),
+        ({"tags": TAGS[[0, 1, 1, 0]]}, "tags must be at least 3 and not on one line, got 4 on"),
         ({"angles": np.full((2, 4), np.nan)}, "angles must be finite"),
         ({"angles": np.full((2, 4), 90.0)}, "angles must be angles in radians"),
         ({"station": [1.0, 2.0]}, "station must have shape"),

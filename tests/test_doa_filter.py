@@ -151,7 +151,7 @@ def test_huber_shrugs_off_a_wrong_direction():
         (lambda f, s: f.update(s, np.full((2, 4), np.nan), np.zeros(3)), "angles must be finite"),
         (lambda f, s: f.update(s, np.ones((2, 3)), np.zeros(3)), "angles must have shape"),
         (lambda f, s: f.update(s, np.ones((2, 4)), np.zeros(2)), "station must have shape"),
-        (lambda f, s: f.update(s, np.ones((2, 4)), np.zeros(3), np.ones(3)), "links must be"),
+        (lambda f, s: f.update(s, np.ones((2, 4)), np.zeros(3), np.ones(3)), "links must have"),
         (lambda f, s: f.update(s, np.ones((2, 4)), np.zeros(3), ranges=np.ones((1, 4))),
          "range_noise must be given"),
         (lambda f, s: make(noise=RANGES), "noise must be a bearing"),

@@ -138,7 +138,7 @@ def test_a_noise_that_is_no_law_is_refused(name):
     state = filter.initial(np.eye(3), np.zeros(3), 0.01 * np.eye(6))
     anchors = 9.0 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     ranges = ranging.distances(anchors, TAGS)
-    with pytest.raises(ValueError, match=r"noise must have variance and .* got 0.1"):
+    with pytest.raises(ValueError, match=r"noise must be a noise law .* got 0.1"):
         filter.update(state, ranges, anchors, noise=0.1)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"noise must fit ranges of shape \(4, 6\)"):
         filter.update(state, ranges, anchors, noise=ranging.LinkNoise(np.ones((3, 6))))

@@ -267,7 +267,7 @@ def test_meaning_of_the_flat_observation_checked_by_hand():
 
 
 def test_environment_of_another_kind_is_named():
-    with pytest.raises(ValueError, match=r"env must have a rbl_gym Scene.*CartPole"):
+    with pytest.raises(ValueError, match=r"env must be RBL/Tracking-v0 or another.*CartPole"):
         EstimatePose(gym.make("CartPole-v1"))
 
 
@@ -282,7 +282,10 @@ def test_environment_that_hides_its_measurements_is_named():
         ({"filter": "ekf"}, "filter must be one of .*uc-kf.*, got 'ekf'"),
         ({"filter": ""}, "filter must be one of"),
         ({"filter": None}, "filter must be one of .*, got None"),
-        ({"options": {"iteration": 3}}, "'iekf' has no option 'iteration'; it has iterations"),
+        (
+            {"options": {"iteration": 3}},
+            "no option 'iteration'; its options are iterations",
+        ),
         ({"filter": "kf", "options": {"robust": True}}, "'kf' has no option 'robust'"),
         ({"filter": "kf/robust=true"}, "'kf' has no option 'robust'"),
         ({"filter": "iekf/robust=true", "options": {"robust": True}}, "option 'robust' twice"),

@@ -272,7 +272,7 @@ def test_frames_are_those_of_the_drawn_scene():
 
 
 def test_scene_beside_scenes_is_refused():
-    with pytest.raises(ValueError, match="scene must be left out with scenes, got 'hall'"):
+    with pytest.raises(ValueError, match="scene must be left out if scenes is given, got 'hall'"):
         gym.make(ID, scene="hall", scenes=MIXED)
 
 
@@ -390,7 +390,11 @@ def test_the_selection_shows_the_drawn_hall_and_what_was_learned():
     ("name", "arguments", "named"),
     [
         ("MobileAnchors", {"scenes": [STILL]}, "scene must have moving anchors"),
-        ("MobileAnchors", {"scenes": CRAFT, "scene": "hall"}, "scene must be left out with scenes"),
+        (
+            "MobileAnchors",
+            {"scenes": CRAFT, "scene": "hall"},
+            "scene must be left out if scenes is given",
+        ),
         ("AnchorSelection", {"scenes": HALLS, "k": 8}, "k must be .* 7, got 8"),
     ],
 )

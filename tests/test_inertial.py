@@ -158,7 +158,7 @@ def test_splines_go_through_poses():
         ),
         (
             lambda: smooth.through([0.0, 1], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), [2]),
-            r"at must lie in \[0, 1\]",
+            r"at must have shape \(T,\) and lie in \[0, 1\]",
         ),
         (
             lambda: smooth.through([0.0, 0], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), [0]),

@@ -24,6 +24,7 @@ from rbl_gym.studies.bench import figures as bench_figures
 from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.bench import worlds as bench_worlds
 from rbl_gym.worlds import scenes
+from tests.helpers import ROOT
 
 SHORT = {"name": "uwb_room", "steps": 4}
 
@@ -570,9 +571,9 @@ def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, cap
     [
         (
             'name = "uwb_room"\nranges = "x.csv"',
-            "must have the key 'name' of a scene, or the files of",
+            "must have either the key 'name'",
         ),
-        ("steps = 3", "must have the key 'name' of a scene, or the files of"),
+        ("steps = 3", "must have either the key 'name'"),
         ('ranges = "ranges.csv"\nspeed = 3', "walk.toml: a recording has no key 'speed'"),
         ('ranges = "ranges.csv"\nanchors = "a.csv"', "walk.toml: a recording needs the key 'tags'"),
         ("ranges = 3", "walk.toml: ranges must be the name of a file, got 3"),
@@ -584,6 +585,11 @@ def test_a_file_that_is_no_scene_is_refused(tmp_path, recording, text, message, 
     recording.write_text(text)
     assert bench(tmp_path, "--scenes", recording)[0] == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_building_file_is_a_scene():
+    path = ROOT / "examples" / "warehouse.toml"
+    assert spec_files.scene_specs([str(path)]) == {"warehouse": {"name": str(path)}}
 
 
 def test_a_filter_is_ours_by_where_its_factory_lives(monkeypatch):

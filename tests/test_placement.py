@@ -473,7 +473,7 @@ def test_bad_problems_are_refused(function, change, message):
 def test_information_that_is_no_number_is_refused():
     task = placement.task("uwb_room")
     bad = np.full((task.n_poses, 6, 6), np.nan)
-    with pytest.raises(ValueError, match="information must be positive and finite"):
+    with pytest.raises(ValueError, match="information must be positive definite"):
         placement.score_of(task, bad)
-    with pytest.raises(ValueError, match="information must be positive and finite"):
+    with pytest.raises(ValueError, match="information must be positive definite"):
         placement.score_of(task, np.broadcast_to(-1e3 * np.eye(6), bad.shape))

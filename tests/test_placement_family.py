@@ -157,7 +157,7 @@ def test_numbers_are_drawn_within_their_bounds():
         ({"scenes": 3}, "scenes must be a list"),
         ({"scenes": ["castle"]}, r"scenes\[0\]: scene must be one of"),
         ({"scenes": ["hall", {"name": "auv_buoys", "racks": 1}]}, r"scenes\[1\]: racks must be 0"),
-        ({"scenes": MIXED, "scene": "hall"}, "scene must be left out with scenes"),
+        ({"scenes": MIXED, "scene": "hall"}, "scene must be left out if scenes is given"),
         ({"scenes": MIXED, "mode": "mounts"}, "scenes must be rooms with walls"),
         ({"scenes": MIXED, "sight": True}, "scenes must be rooms with walls"),
         ({"scenes": MIXED, "mode": "all"}, "mode must be one of"),

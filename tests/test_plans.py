@@ -217,7 +217,7 @@ def test_layers_are_mapped_by_patterns_the_first_that_matches():
     made = layers.building(found, told)
     assert [wall["material"] for wall in made.tables["walls"]] == ["concrete", "drywall"]
     assert made.used == {"A-WALL-EXT": ["walls"], "A-WALL-INT": ["walls"]}
-    with pytest.raises(ValueError, match=r"no layer is called 'B'; there are 'A-WALL-EXT', "):
+    with pytest.raises(ValueError, match=r"no layer is called 'B'; the layers are 'A-WALL-EXT', "):
         layers.building(found, uses("zones B"))
 
 

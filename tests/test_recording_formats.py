@@ -102,7 +102,7 @@ def test_a_column_that_is_mapped_and_not_there(tmp_path):
 def test_a_pair_of_columns_the_wrong_way_round(tmp_path):
     text = LONG.replace("t,", "zeit,", 1)
     with pytest.raises(
-        ValueError, match=r"'zeit' is not a known quantity; did you mean time=zeit\?$"
+        ValueError, match=r"'zeit' is not the name of a quantity; did you mean time=zeit\?$"
     ):
         read_as(tmp_path, text, columns={"zeit": "time"})
     assert len(read_as(tmp_path, text, columns={"time": "zeit"}).times) == 2
@@ -222,7 +222,7 @@ def test_one_zero_in_a_wide_log(tmp_path):
 def test_a_log_that_is_a_fifth_bad_is_read_and_one_that_is_more_is_refused(tmp_path):
     bad: dict[str, Any] = {f"r{k}": "0" for k in (2, 4)} | {"r5": "-1", "r6": "nan"}
     assert read(tmp_path, many(20, **bad)).links.sum() == 16
-    message = r"5 of 20 ranges cannot be used: 1 not a number, 3 zero, 1 negative; .* line 4, "
+    message = r"5 of 20 ranges cannot be used .1 not a number, 3 zero, 1 negative., .* line 4, "
     with pytest.raises(ValueError, match=message):
         read(tmp_path, many(20, **bad, r7="0"))
 
@@ -232,7 +232,7 @@ def test_unknown_ids(tmp_path):
     log = read(tmp_path, text)
     assert log.report.dropped == {"of an unknown anchor": 1, "of an unknown tag": 1}
     assert "1 of an unknown anchor (E), 1 of an unknown tag (7)" in note_of(log, "left out")
-    with pytest.raises(ValueError, match=r"line 22, column 'anchor': unknown anchor, .*, got 'E'"):
+    with pytest.raises(ValueError, match=r"line 22, column 'anchor': .* one of A, B, C, got 'E'"):
         read_as(tmp_path, text, strict=True)
 
 
@@ -286,7 +286,7 @@ def test_rows_that_come_twice(tmp_path, wide):
 def test_coarse_stamps_are_refused(tmp_path):
     """Ten ranges of a link within each second are no log of one range a second."""
     rows = "".join(f"{k // 10},A,1,{2 + 0.01 * k}\n" for k in range(40))
-    message = "36 of 40 ranges cannot be used: 36 twice with two values; .*stamps too coarse"
+    message = "36 of 40 ranges cannot be used .36 twice with two values., .*stamps too coarse"
     with pytest.raises(ValueError, match=message):
         read(tmp_path, "t,anchor,tag,range\n" + rows)
 
@@ -531,7 +531,7 @@ def test_units_of_the_header_that_are_none(tmp_path):
         ({"where": {"run": "7"}}, r"line 1: no column 'run' to choose rows by, got \['t', "),
         ({"where": {"anchor": "Z"}}, r"line 1: no row has anchor=Z, got \['A', 'B', 'C'\]"),
         ({"columns": {"*": "B_*"}}, r"line 1: no column fits 'B_\*', got \['t', "),
-        ({"columns": {"*": "B_"}}, r"a column named \* needs a pattern with a \*, got 'B_'"),
+        ({"columns": {"*": "B_"}}, r"the value of \* must have a \*, as in \*=B_\*, got 'B_'"),
         ({"columns": {"range": "r_{tag}"}}, "columns of links must be like .*, got 'r_{tag}'"),
     ],
 )

@@ -60,7 +60,7 @@ def test_metres_pass(name, one_at_a_time):
 @pytest.mark.parametrize("name", ["room", "ceiling", "map"])
 def test_tags_in_another_unit_are_refused(name, factor, one_at_a_time):
     anchors, tags = GOOD[name]
-    unit = {100: "centimetres", 1000: "millimetres"}[factor]
+    unit = {100: "cm", 1000: "mm"}[factor]
     seen = recording(anchors, tags, 0.05, 2, one_at_a_time)
     with pytest.raises(ValueError, match=rf"tags.csv: units look inconsistent, .*{unit}\?"):
         check_units(PATHS, *seen, anchors, factor * tags)
@@ -71,7 +71,7 @@ def test_a_small_body_far_away_in_centimetres_is_refused():
     anchors = 20 * ROOM
     seen = recording(anchors, 0.5 * SOLID)
     check_units(PATHS, *seen, anchors, 0.5 * SOLID)
-    with pytest.raises(ValueError, match=r"tags.csv: .* differ by \S+ % .*centimetres\?"):
+    with pytest.raises(ValueError, match=r"tags.csv: .* differ by at most \S+ % .* in cm\?"):
         check_units(PATHS, *seen, anchors, 50 * SOLID)
 
 

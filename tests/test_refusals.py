@@ -11,8 +11,8 @@ import pytest
 from rbl_gym import bounds, estimators, motion
 from rbl_gym.app import terminal
 from rbl_gym.bounds import links as link_bounds
+from rbl_gym.checks import as_tuples
 from rbl_gym.geometry import bodies
-from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.measurements import ranging
 from rbl_gym.networks import rigidity
 from rbl_gym.placement import design, scene_files
@@ -221,6 +221,7 @@ def test_rooms_full_of_obstacles():
     low, high = np.array(scenes.get("uwb_room").anchor_region.bounds())
     full = np.concatenate([0.5 * (low + high), (high - low)])
     problem = scene_files.problem("uwb_room")
-    problem = dataclasses.replace(problem, obstacles=Obstacles(full[None], 0.01))
-    with pytest.raises(ValueError, match="anchors have no permitted place: obstacles cover all"):
+    scene = dataclasses.replace(problem.scene, obstacles=as_tuples(full[None]))
+    problem = dataclasses.replace(problem, scene=scene)
+    with pytest.raises(ValueError, match="6 anchors cannot be mounted: obstacles leave 0"):
         design.free_candidates(problem, np.random.default_rng(0), 10)

@@ -242,7 +242,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "scene.noise has no field 'floor'; its fields are floor_m, proportional",
     ),
     ({"noise": {"kind": "range", "floor": 1}}, "scene.noise:"),
-    ({"dt": {"value": 1}}, "scene.dt must be a value, not a dict of fields, got {'value': 1}"),
+    ({"dt": {"value": 1}}, "scene.dt must be one value, got the dict {'value': 1}"),
     ({"noise": 0.1}, "scene.noise must be a dict of its fields, got 0.1"),
     ({"links": None}, "scene.links must be a dict of its fields, got None"),
     # kinds

@@ -54,5 +54,5 @@ def test_bad_actions_are_named(action, message):
 
 
 def test_an_environment_without_a_scene_is_refused():
-    with pytest.raises(ValueError, match="env must have a rbl_gym Scene"):
+    with pytest.raises(ValueError, match="env must be RBL/Tracking-v0 or another"):
         SelectAnchors(gym.make("CartPole-v1"))

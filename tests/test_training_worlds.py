@@ -81,7 +81,7 @@ def test_a_task_in_other_worlds_keeps_what_else_it_says():
     task = rl_task("selection").in_worlds(scenes=["hall"])
     assert task.family().n_anchors == 12
     assert rl_task("selection").in_worlds() is rl_task("selection")
-    with pytest.raises(ValueError, match="must be left out with scenes"):
+    with pytest.raises(ValueError, match="must be left out if scenes is given"):
         task.in_worlds("hall", ["hall"])
 
 

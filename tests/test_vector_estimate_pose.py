@@ -70,7 +70,7 @@ def test_wraps_what_make_vec_gives_and_computes_no_bound_where_none_is_asked_for
 
 
 def test_wrong_environments_and_names_are_named():
-    with pytest.raises(ValueError, match="env must have a rbl_gym Scene"):
+    with pytest.raises(ValueError, match="env must be RBL/Tracking-v0 or another"):
         VectorEstimatePose(gym.make_vec("CartPole-v1", num_envs=2))
     with pytest.raises(ValueError, match=r"reward must be one of 'belief'.*got 'gold'"):
         VectorEstimatePose(TrackingVectorEnv(2), reward="gold")

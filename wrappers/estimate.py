@@ -158,8 +158,9 @@ def scene_of(env: Any) -> Scene:
     scene = getattr(unwrapped, "scene", None)
     if not isinstance(scene, Scene):
         raise ValueError(
-            "env must have a rbl_gym Scene as its scene, as RBL/Tracking-v0 has; tasks that run "
-            f"a filter themselves have none, got {unwrapped!r}"
+            "env must be RBL/Tracking-v0 or another environment with a Scene as its attribute "
+            "scene; environments that run a filter themselves, such as RBL/AnchorSelection-v0, "
+            f"cannot be wrapped; got {unwrapped}"
         )
     return scene
 

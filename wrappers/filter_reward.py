@@ -249,7 +249,7 @@ def _worlds(arguments: dict[str, Any]) -> dict[str, Any]:
     """Return the arguments with `scene` or `scenes`; raises ValueError if both are given."""
     scene, scenes = arguments.get("scene", "auv_buoys"), arguments.get("scenes")
     if scenes is not None and scene != "auv_buoys":
-        raise ValueError(f"scene must be left out with scenes, got {scene!r:.80}")
+        raise ValueError(f"scene must be left out if scenes is given, got {scene!r:.80}")
     left_out = "scenes" if scenes is None else "scene"
     return {key: value for key, value in arguments.items() if key != left_out}
 

@@ -32,7 +32,7 @@ def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> Scene
     if value is None:
         return None
     if scene != usual:
-        raise ValueError(f"scene must be left out with scenes, got {scene!r:.80}")
+        raise ValueError(f"scene must be left out if scenes is given, got {scene!r:.80}")
     members = [{"name": one} if isinstance(one, str) else one for one in family(value).members]
     return family([{**defaults, **one} if isinstance(one, Mapping) else one for one in members])
 

@@ -264,9 +264,9 @@ def _joined(old: Any, rows: list[np.ndarray], parts: list[Any], count: int) -> A
         return parts[0]
     if len({tuple(np.shape(field)[1:] for field in part) for part in parts}) > 1:
         raise ValueError(
-            "filter must have states of one size in worlds of different sizes, got "
+            "filter must have states of the same shape in all worlds, got "
             f"{' and '.join(str([np.shape(f)[1:] for f in part]) for part in parts[:2])}: use "
-            "gym.make_vec(..., vectorization_mode='sync') of EstimatePose"
+            "gym.make_vec(..., vectorization_mode='sync') with EstimatePose"
         )
     fields = []
     for index, first in enumerate(parts[0]):

@@ -93,9 +93,8 @@ class IteratedEkfBank:
         if self.volume is not None:
             volume = check_array("volume", self.volume, (2, 3))
             if volume.shape != (2, 3) or (volume[0] > volume[1]).any():
-                raise ValueError(
-                    f"volume must be a lower and an upper corner (2, 3), got {self.volume!r:.80}"
-                )
+                corners = "[lower corner, upper corner], shape (2, 3)"
+                raise ValueError(f"volume must be {corners}, got {volume.tolist()!s:.80}")
             object.__setattr__(self, "volume", volume)
 
     @functools.cached_property

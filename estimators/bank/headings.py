@@ -130,7 +130,8 @@ class HeadingBank:
         told = np.asarray(twist, dtype=np.float64)
         if told.ndim < trailing:
             shape = "(..., 6)" if trailing == 1 else "(..., S, 6)"
-            raise ValueError(f"readings must have shape {shape}, got {told.shape}")
+            name = "twist" if trailing == 1 else "readings"
+            raise ValueError(f"{name} must have shape {shape}, got {told.shape}")
         twist = np.expand_dims(told, -1 - trailing)
         steps = np.expand_dims(np.asarray(dt), -2) if np.ndim(dt) else dt
         moved: AugmentedState = self.filter.predict(_filtered(state), twist, steps)  # pyright: ignore[reportArgumentType]

@@ -116,8 +116,8 @@ def inertial_clock(
     windows = _windows(times, readings, float(told.times[0]), _SLOW_S)
     if np.ptp(told.times) < _WINDOW_S or not windows:
         raise ValueError(
-            f"imu and ranges have no {_WINDOW_S:g} s without gaps, so the offset cannot be "
-            "estimated: give the offset"
+            f"imu and ranges must overlap for {_WINDOW_S:g} s without a gap to estimate the time "
+            "offset: give the offset in seconds"
         )
     arms = np.zeros_like(told.tags)
     path: Any = start
@@ -225,20 +225,21 @@ def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, 
     tried = (seconds >= 0.5 * seconds.max()) & (np.abs(offsets - near_s) <= search_s + 1e-9)
     if not tried.any():
         raise ValueError(
-            f"imu and ranges overlap too little at offsets within {search_s:g} s of {near_s:g} s: "
-            "give a rough offset"
+            f"imu and ranges overlap too little at time offsets from {near_s - search_s:g} to "
+            f"{near_s + search_s:g} s: give a rough offset in seconds"
         )
     score = np.where(tried, score, 0.0)
     best = int(np.argmax(score))
-    what = "accelerations of imu and of the track from the ranges agree"
+    what = "the accelerations of imu and of the track from the ranges agree"
     if score[best] < _LEAST:
         raise ValueError(
-            f"{what} at no offset (highest correlation {score[best]:.2f}, at "
-            f"{offsets[best]:+.2f} s): give the offset"
+            f"{what} too little at every time offset (highest correlation {score[best]:.2f}, at "
+            f"{offsets[best]:+.2f} s): give the offset in seconds"
         )
     if best in np.flatnonzero(tried)[[0, -1]]:
         raise ValueError(
-            f"{what} best at {offsets[best]:+.2f} s, the end of the search: give a rough offset"
+            f"{what} best at {offsets[best]:+.2f} s, the end of the search: give a rough offset in "
+            "seconds"
         )
     elsewhere = np.where(np.abs(offsets - offsets[best]) > _PEAK_S, score, 0.0)
     rival = int(np.argmax(elsewhere))
@@ -247,7 +248,8 @@ def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, 
     if gain < _GAIN:
         raise ValueError(
             f"{what} about as well at {offsets[rival]:+.2f} s as at {offsets[best]:+.2f} s "
-            f"(correlations {elsewhere[rival]:.2f} and {score[best]:.2f}): give the offset"
+            f"(correlations {elsewhere[rival]:.2f} and {score[best]:.2f}): give the offset in "
+            "seconds"
         )
     return best, rival, gain
 

@@ -174,8 +174,8 @@ def _check_count(problem: _Problem) -> None:
     if told < unknown:
         raise ValueError(
             f"ranges must be at least as many as the unknowns, got {told} ranges and {unknown} "
-            f"unknowns ({_pose_axes(problem)} for each pose): the "
-            "epochs need more ranges than their poses have unknowns"
+            f"unknowns (coordinates of anchors, and {_pose_axes(problem)} for each epoch): each "
+            f"epoch needs more than {_pose_axes(problem)} ranges"
         )
 
 

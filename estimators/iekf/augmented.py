@@ -325,7 +325,7 @@ def told_twist(
     """Return the state after a sensor reading, and the twist (..., 6) if it is known."""
     known = filter.twist is None
     if twist is None and known:
-        raise ValueError("twist must be given to a filter that does not estimate it, got None")
+        raise ValueError("twist must be given, as this filter does not estimate it, got None")
     told = _AT_REST if twist is None else check_array("twist", twist, (6,))
     if twist is not None and filter.sensor is not None and not known:
         state = _sensed(state, told, filter.sensor)

@@ -200,8 +200,10 @@ def _check_heard(links: ArrayLike | None, n_tags: int) -> BoolArray | None:
     mask = np.asarray(links)
     if mask.ndim > 1 and mask.shape[-2] == 1:
         mask = mask[..., 0, :]
-    if mask.shape[-1:] != (n_tags,) or not np.isin(mask, (0, 1)).all():
-        raise ValueError(f"links must be a mask (..., {n_tags}), got shape {mask.shape}")
+    if mask.shape[-1:] != (n_tags,):
+        raise ValueError(f"links must have shape (..., {n_tags}), got {mask.shape}")
+    if not (right := np.isin(mask, (0, 1))).all():
+        raise ValueError(f"links must be True (measured) or False, got {mask[~right][0]}")
     mask = mask.astype(np.bool_)
     return None if mask.all() else mask
 

@@ -86,10 +86,10 @@ class OdometryEkf(AugmentedEkf):
             If a shape is wrong, a reading is infinite, or a time is negative.
         """
         readings = np.asarray(readings, dtype=np.float64)
-        if readings.ndim < 2 or readings.shape[-1] != 6 or np.isinf(readings).any():
-            raise ValueError(
-                f"readings must be finite or NaN and (..., S, 6), got shape {readings.shape}"
-            )
+        if readings.ndim < 2 or readings.shape[-1] != 6:
+            raise ValueError(f"readings must have shape (..., S, 6), got {readings.shape}")
+        if np.isinf(readings).any():
+            raise ValueError("readings must be finite, or NaN where there is none, got inf")
         steps, state = navigation.steps_of(dt, readings), plain(state)
         check_batches(state=state.translation.shape[:-1], readings=readings.shape[:-2])
         for k in range(readings.shape[-2]):

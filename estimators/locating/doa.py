@@ -114,9 +114,17 @@ def locate_doa(
         distance_weight = check_number("distance_weight", distance_weight, low=1e-12)
     tags = check_array("tags", tags, ("N", 3))
     if tags.shape[-2] < 3 or (spanned_dimensions(tags) < 2).any():
-        raise ValueError(f"tags must be at least 3 and not collinear, got shape {tags.shape}")
-    if (np.ptp(tags, axis=-2).max(axis=-1) < _SMALLEST_BODY_M).any():
-        raise ValueError(f"tags must span at least {_SMALLEST_BODY_M:g} m, got {tags!r:.80}")
+        count = tags.shape[-2]
+        raise ValueError(
+            "tags must be at least 3 and not on one line, got "
+            f"{f'{count} on one line' if count > 2 else count}"
+        )
+    spans = np.ptp(tags, axis=-2).max(axis=-1)
+    if (spans < _SMALLEST_BODY_M).any():
+        raise ValueError(
+            f"tags must be at least {_SMALLEST_BODY_M:g} m apart, got {spans.min():g} m: are they "
+            "in metres?"
+        )
     angles = bearing.check_angles(angles, tags.shape[-2])
     where = np.zeros(3) if station is None else check_array("station", station, (3,))
     batch = np.broadcast_shapes(angles.shape[:-2], tags.shape[:-2], where.shape[:-1])

@@ -20,6 +20,7 @@ from rbl_gym.checks import (
     check_array,
     check_number,
     check_one_of,
+    did_you_mean,
     kernel,
 )
 from rbl_gym.estimators.inputs import (
@@ -338,4 +339,7 @@ def _method(name: str) -> Callable[[StaticEpoch], Fit]:
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         if entry.name == name:
             return entry.load()
-    raise ValueError(f"method must be one of {', '.join(map(repr, methods()))}, got {name!r}")
+    raise ValueError(
+        f"method must be one of {', '.join(map(repr, methods()))}, got {name!r:.80}"
+        f"{did_you_mean(name, methods())}"
+    )

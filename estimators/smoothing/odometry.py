@@ -54,10 +54,10 @@ class OdometryMotion:
 
     def __post_init__(self) -> None:
         readings = np.asarray(self.readings, dtype=np.float64)
-        if readings.ndim < 3 or readings.shape[-1] != 6 or np.isinf(readings).any():
-            raise ValueError(
-                f"readings must be finite or NaN and (..., K - 1, S, 6), got shape {readings.shape}"
-            )
+        if readings.ndim < 3 or readings.shape[-1] != 6:
+            raise ValueError(f"readings must have shape (..., K - 1, S, 6), got {readings.shape}")
+        if np.isinf(readings).any():
+            raise ValueError("readings must be finite, or NaN where there is none, got inf")
         object.__setattr__(self, "readings", readings)
         object.__setattr__(self, "steps", navigation.check_steps(self.steps, readings))
         if not isinstance(self.sensor, OdometrySensor):

@@ -359,8 +359,9 @@ def _checked(
         Q, t = np.broadcast_to(Q, (*batch, K, 3, 3)), np.broadcast_to(t, (*batch, K, 3))
     except ValueError as error:
         raise ValueError(
-            f"log, prior and start must fit {K} times, got ranges {ranges.shape}, anchors "
-            f"{anchors.shape}, start {Q.shape} and {t.shape}, prior {covariance.shape}"
+            f"log and start must have {K} epochs, as times has, and their leading axes must "
+            f"broadcast; got ranges {ranges.shape}, anchors {anchors.shape}, start {Q.shape} and "
+            f"{t.shape}, prior covariance {covariance.shape}"
         ) from error
     told = ranges
     if model.offset is not None or model.clock is not None:

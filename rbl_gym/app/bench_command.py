@@ -35,8 +35,9 @@ def add_bench(commands: Any) -> None:
         "--filters",
         type=names,
         metavar="A,B",
-        help=f"{FILTER_HELP}. Default: all filters except iekf-bank, iekf-bias, iekf-cv, iekf-imu "
-        "and iekf-log; also iekf/robust=true, and the filters made for each scene",
+        help=f"filters to compare, each {FILTER_HELP}. Default: all filters except iekf-bank, "
+        "iekf-bias, iekf-cv, iekf-imu and iekf-log; also iekf/robust=true, and the filters made "
+        "for each scene",
     )
     bench.add_argument(
         "--scenes",
@@ -85,7 +86,9 @@ def add_rerun(commands: Any) -> None:
 
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--jobs", type=positive, default=1, help="number of processes, default 1")
+    parser.add_argument(
+        "--jobs", type=positive, default=1, metavar="N", help="number of processes, default 1"
+    )
     parser.add_argument(
         "--backend", choices=backends.BACKENDS, help="backend of joblib, default loky"
     )

@@ -24,6 +24,7 @@ def add_bounds(commands: Any) -> None:
     bounds.add_argument(
         "--scene",
         default="uwb_room",
+        metavar="NAME|F",
         help="name of a scene, or a .toml or .json file with a changed scene; default uwb_room",
     )
     add_trials(bounds, 20)

@@ -7,7 +7,15 @@ import os
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
-from rbl_gym.app.terminal import add_json, offset, print_files, progress, window, write_json
+from rbl_gym.app.terminal import (
+    add_json,
+    add_plot,
+    offset,
+    print_files,
+    progress,
+    window,
+    write_json,
+)
 
 
 def add_calibrate(commands: Any) -> None:
@@ -32,9 +40,7 @@ def add_calibrate(commands: Any) -> None:
     output.add_argument(
         "--out", metavar="DIR", help="folder for calibration.csv, tags.csv, ..., which replay reads"
     )
-    output.add_argument(
-        "--plot", metavar="F", help="picture of the biases and residuals of the links"
-    )
+    add_plot(output, "of the biases and residuals of the links")
     add_json(output)
     calibrate.set_defaults(run=_calibrate)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from gymnasium.error import Error as GymError
+
 from rbl_gym import __version__
+from rbl_gym.app.parser import Parser, with_options
 from rbl_gym.studies.extras import MissingExtraError
 
 # The commands and the module of `rbl_gym.app` with the function `add_NAME` of each, in the order of
@@ -33,6 +35,8 @@ _COMMANDS = {
 }
 # Status of a program whose reader has gone (`| head`): 128 + SIGPIPE, as of git.
 READER_GONE = 141
+# Status of a program that Ctrl-C ended: 128 + SIGINT.
+INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,6 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(nowhere, stream.fileno())
         return READER_GONE
+    except KeyboardInterrupt:
+        print("rbl-gym: interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _flush() -> None:
@@ -79,14 +86,15 @@ def _run(arguments: Sequence[str] | None) -> int:
     except OSError as error:
         said = f"{error.filename}: {error.strerror}" if error.filename else error
         print(f"rbl-gym {options.command}: {said}", file=sys.stderr)
-    except ValueError as error:
-        print(f"rbl-gym {options.command}: {error}", file=sys.stderr)
+    except (ValueError, GymError) as error:
+        said = with_options(str(error), options, arguments)
+        print(f"rbl-gym {options.command}: {said}", file=sys.stderr)
     return 2
 
 
-def _parser(command: str = "") -> argparse.ArgumentParser:
+def _parser(command: str = "") -> Parser:
     """Return the parser of one command; of all commands if there is none of this name."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="rbl-gym",
         description="Localization of rigid bodies by radio. Help for a command: rbl-gym COMMAND "
         "--help.",

@@ -22,7 +22,7 @@ from rbl_gym.worlds.scene_source import read_scene, read_scenes
 
 # Number of held-out worlds for the score of a trained policy, as in ``evaluate``.
 _WORLDS = 256
-_TASK_HELP = "task (docs/learning.md)"
+_TASK_HELP = f"{', '.join(sorted(TASKS))}: see docs/learning.md"
 
 
 def add_train(commands: Any) -> None:
@@ -33,7 +33,7 @@ def add_train(commands: Any) -> None:
         description="Train a policy on a task. The same seed gives the same policy. See "
         "docs/learning.md for the tasks.",
     )
-    train.add_argument("task", choices=sorted(TASKS), help=_TASK_HELP)
+    train.add_argument("task", choices=sorted(TASKS), metavar="TASK", help=_TASK_HELP)
     _add_worlds(train)
     train.add_argument(
         "--algorithm",
@@ -43,7 +43,8 @@ def add_train(commands: Any) -> None:
     train.add_argument(
         "--steps",
         type=positive,
-        help="number of steps; default: that of the results in docs/learning.md",
+        metavar="N",
+        help="number of steps of training; default: that of the results in docs/learning.md",
     )
     add_seed(train)
     train.add_argument("--out", metavar="F", help="file of the policy, default out/TASK-SEED.npz")
@@ -82,6 +83,7 @@ def add_transfer(commands: Any) -> None:
         "--repeats",
         type=positive,
         default=16,
+        metavar="N",
         help="bodies in each world of a placement task, default 16",
     )
     add_json(transfer)
@@ -131,7 +133,7 @@ def _add_players(
     parser: argparse.ArgumentParser, tasks: list[str], worlds: int, references: str
 ) -> None:
     """Add options for the task, the policies and references, and the worlds."""
-    parser.add_argument("task", choices=sorted(tasks), help=_TASK_HELP)
+    parser.add_argument("task", choices=sorted(tasks), metavar="TASK", help=_TASK_HELP)
     _add_worlds(parser)
     parser.add_argument(
         "--policy",
@@ -141,10 +143,16 @@ def _add_players(
         help="file of a policy, from rbl-gym train; may be given several times",
     )
     parser.add_argument(
-        "--references", metavar="A,B", help=f"reference methods; default: {references}"
+        "--references",
+        metavar="A,B",
+        help=f"reference methods, as in random,greedy; default: {references}",
     )
     parser.add_argument(
-        "--worlds", type=positive, default=worlds, help=f"number of worlds, default {worlds}"
+        "--worlds",
+        type=positive,
+        default=worlds,
+        metavar="N",
+        help=f"number of worlds, default {worlds}",
     )
     add_seed(parser, "seed of the worlds")
 

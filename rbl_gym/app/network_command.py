@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from rbl_gym.app.terminal import add_json, print_files, write_json
+from rbl_gym.app.terminal import add_json, add_plot, print_files, write_json
 
 
 def add_network(commands: Any) -> None:
@@ -26,9 +26,7 @@ def add_network(commands: Any) -> None:
         default="information",
         help="weights of the edges: information of theta in the file (default), or equal weights",
     )
-    network.add_argument(
-        "--plot", metavar="F", help="picture of the graph and of the residuals of its edges"
-    )
+    add_plot(network, "of the graph and of the residuals of its edges")
     add_json(network)
     network.set_defaults(run=_network)
 

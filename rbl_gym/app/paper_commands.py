@@ -8,6 +8,7 @@ from typing import Any
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
+    add_plot,
     add_trials,
     check_html,
     print_files,
@@ -27,9 +28,7 @@ def add_demo(commands: Any) -> None:
         ),
     )
     add_trials(demo)
-    demo.add_argument(
-        "--plot", default="out/demo.png", metavar="F", help="picture, default out/demo.png"
-    )
+    add_plot(demo, "of the errors and a track, default out/demo.png", "out/demo.png")
     add_html(demo, "page with a trial in 3-D, charts and tables")
     add_json(demo)
     demo.set_defaults(run=_demo)
@@ -63,12 +62,17 @@ def add_reproduce(commands: Any) -> None:
         "reproduce",
         help="reproduce an experiment of a paper: tables, figures, CSV",
         description="Run an experiment of a paper again, and print its table.",
-        epilog="\n".join(f"{name}: {e.summary}" for name, e in experiments().items()),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="experiments:\n"
+        + "\n".join(f"  {name:<11} {e.summary}" for name, e in experiments().items()),
     )
-    reproduce.add_argument("experiment", choices=sorted(experiments()))
+    reproduce.add_argument(
+        "experiment",
+        choices=sorted(experiments()),
+        metavar="EXPERIMENT",
+        help="one of the experiments that are listed below",
+    )
     add_trials(reproduce)
-    reproduce.add_argument("--plot", metavar="F", help="picture, default out/EXPERIMENT.png")
+    add_plot(reproduce, "of the results, default out/EXPERIMENT.png")
     reproduce.add_argument("--csv", metavar="F", help="CSV file with all results, one on each row")
     network = reproduce.add_argument_group("network2009")
     network.add_argument(

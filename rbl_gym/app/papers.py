@@ -57,7 +57,7 @@ def experiments() -> dict[str, Experiment]:
     """Return all experiments by name."""
     return {
         "camsap2013": Experiment(
-            "tracking with KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2, 3)",
+            "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2, 3)",
             _tracking,
             _camsap2013_figure,
             _shown("reports", "print_camsap2013"),
@@ -75,7 +75,7 @@ def experiments() -> dict[str, Experiment]:
             _shown("hard_figures", "print_hard"),
         ),
         "icassp2013": Experiment(
-            "a pose from one epoch of ranges: LS, CLS, Procrustes, ML (Figs 2, 3)",
+            "one epoch of ranges: LS, CLS, Procrustes, ML (Figs 2, 3)",
             _static,
             _drawn("figures", "static_figure"),
             _shown("reports", "print_static"),

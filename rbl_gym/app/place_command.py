@@ -16,6 +16,7 @@ from rbl_gym.app.plan_options import (
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
+    add_plot,
     add_trials,
     check_html,
     natural,
@@ -82,8 +83,8 @@ def add_place(commands: Any) -> None:
         "--start",
         choices=("search", "amortised"),
         default="search",
-        help="amortised: start from the layout of a trained network and evaluate the score at most "
-        "20 times, instead of the search",
+        help="search (default): search over layouts; amortised: start from the layout of a "
+        "trained network and evaluate the score at most 20 times",
     )
     place.add_argument(
         "--racks",
@@ -99,7 +100,7 @@ def add_place(commands: Any) -> None:
         help="work region, metres; write --region=-1,... if the first number is negative",
     )
     add_trials(place, 500, "number of trials of the check with filters")
-    place.add_argument("--plot", metavar="F", help="picture with maps over the plan, and layouts")
+    add_plot(place, "with maps over the plan, and layouts")
     add_html(place, "page with the plan, its maps, the tables and the scene in 3-D")
     add_report_options(place)
     add_json(place)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.plan_options import add_plan_options, is_plan, picture, read_plan
-from rbl_gym.app.terminal import add_json, positive, print_files, write_json
+from rbl_gym.app.terminal import add_json, add_plot, positive, print_files, write_json
 
 
 def add_plan(commands: Any) -> None:
@@ -19,13 +19,11 @@ def add_plan(commands: Any) -> None:
         "or from a picture. Without --out: show the layers. See docs/placement.md.",
     )
     plan.add_argument(
-        "plan", metavar="F", help="a .dxf, .geojson, .png or .jpg file, or a building file"
+        "plan", metavar="FILE", help="a .dxf, .geojson, .png or .jpg file, or a building file"
     )
     plan.add_argument("-o", "--out", metavar="F", help="name of the building file, .toml")
     plan.add_argument("--anchors", type=positive, metavar="N", help="number of anchors, default 8")
-    plan.add_argument(
-        "--plot", metavar="F", help="picture of the building as read, with a grid in metres"
-    )
+    add_plot(plan, "of the building as read, with a grid in metres")
     add_plan_options(plan)
     add_json(plan)
     plan.set_defaults(run=_plan)

@@ -39,7 +39,10 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     for kind, text in _HELP.items():
         plan.add_argument(f"--{kind}", action="append", default=[], metavar="LAYER", help=text)
     plan.add_argument(
-        "--units", metavar="U", help="unit of the drawing: mm, cm, m, km, in, ft or degrees"
+        "--units",
+        metavar="U",
+        help="unit of the drawing: mm, cm, m, km, in, ft or degrees; default: the unit that a DXF "
+        "states, metres for GeoJSON",
     )
     plan.add_argument(
         "--zero",
@@ -48,7 +51,9 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
         help="point of the drawing, in its units, that becomes the origin (0, 0)",
     )
     plan.add_argument(
-        "--layer-property", metavar="P", help="GeoJSON property with the name of the layer"
+        "--layer-property",
+        metavar="P",
+        help="GeoJSON property with the name of the layer; default: layer, kind or class",
     )
     plan.add_argument(
         "--height",
@@ -61,7 +66,7 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
         "--picture", metavar="F", help="picture to show behind the drawing or the building"
     )
     plan.add_argument(
-        "--metres-per-pixel", type=float, metavar="M", help="scale of the picture, metres"
+        "--metres-per-pixel", type=float, metavar="M", help="scale of the picture: metres per pixel"
     )
     plan.add_argument(
         "--width",

@@ -78,7 +78,11 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
             "else detected"
         ),
     )
-    reading.add_argument("--unit", metavar="UNIT", help="unit of --ranges: m, cm or mm; default m")
+    reading.add_argument(
+        "--unit",
+        metavar="UNIT",
+        help="unit of --ranges: m, cm or mm; default: from the header, else m",
+    )
     reading.add_argument(
         "--offset",
         choices=OFFSETS,
@@ -95,7 +99,10 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
         ),
     )
     reading.add_argument(
-        "--turn-unit", metavar="UNIT", default="rad/s", help="unit of turn rates: rad/s or deg/s"
+        "--turn-unit",
+        metavar="UNIT",
+        default="rad/s",
+        help="unit of the turn rates of --odometry and --imu: rad/s or deg/s; default rad/s",
     )
     reading.add_argument(
         "--run",

@@ -18,6 +18,7 @@ from rbl_gym.app.terminal import (
     FILTER_HELP,
     add_html,
     add_json,
+    add_plot,
     check_html,
     print_files,
     progress,
@@ -40,8 +41,7 @@ def add_replay(commands: Any) -> None:
         "replay",
         help="track a body with the ranges of a recording",
         description="Track a body with the ranges of a recording. With --truth, report the errors. "
-        "See "
-        "docs/recordings.md.",
+        "See docs/recordings.md.",
     )
     add_reading(replay)
     _add_knowledge(replay.add_argument_group("knowledge of the body's position"))
@@ -186,7 +186,8 @@ def _add_smoothing(group: Any) -> None:
 
 def _add_comparison(group: Any) -> None:
     _add_numbers(group, (
-        ("yaw-offset-deg", "yaw error = estimate - (truth + offset)"),
+        ("yaw-offset-deg", "constant that is added to the yaw of the truth, if the table of tags "
+         "is turned against the body frame of the truth; degrees, default 0"),
         ("truth-gap-s", "longest interpolated gap of truth or ranges, seconds, default 0.5"),
     ))  # fmt: skip
     group.add_argument(
@@ -213,7 +214,7 @@ def _add_output(group: Any) -> None:
         help="file of the track, with --smooth of the smoothed one: .tum or .txt (TUM format), or "
         ".csv with covariance, NIS and rank",
     )
-    group.add_argument("--plot", metavar="F", help="picture of the track and the errors")
+    add_plot(group, "of the track and the errors")
     add_html(group, "page with the track in 3-D, charts and tables")
     add_json(group)
 

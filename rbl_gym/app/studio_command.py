@@ -45,6 +45,7 @@ def add_studio(commands: Any) -> None:
         "--port",
         type=natural,
         default=8080,
+        metavar="N",
         help="first port that is tried, default 8080; 0: any free port",
     )
     studio.add_argument(

@@ -17,10 +17,12 @@ from rbl_gym.studies.extras import require
 from rbl_gym.studies.progress import Advance
 
 FILTER_HELP = (
-    "NAME, NAME/option=value/option=value or MODULE:FACTORY (see Filters with options in "
-    "docs/estimators.md)"
+    "NAME, NAME/option=value/option=value or MODULE:FACTORY, as in iekf/robust=true (see Filters "
+    "with options in docs/estimators.md)"
 )
 
+# Formats of pictures.
+_PICTURES = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".eps")
 # Time between two updates of a progress bar.
 _REFRESH_S = 0.05
 
@@ -38,7 +40,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 def add_seed(parser: argparse.ArgumentParser, of: str = "seed of all random numbers") -> None:
     """Add the option --seed."""
-    parser.add_argument("--seed", type=natural, default=0, help=f"{of}, default 0")
+    parser.add_argument("--seed", type=natural, default=0, metavar="N", help=f"{of}, default 0")
 
 
 def add_trials(
@@ -46,14 +48,27 @@ def add_trials(
 ) -> None:
     """Add the options --trials and --seed."""
     parser.add_argument(
-        "--trials", type=positive, default=default, help=f"{what}, default {default}"
+        "--trials", type=positive, default=default, metavar="N", help=f"{what}, default {default}"
     )
     add_seed(parser)
 
 
+def add_plot(parser: argparse._ActionsContainer, shows: str, default: str | None = None) -> None:
+    """Add the option --plot; the name of the file is checked before the work."""
+    parser.add_argument(
+        "--plot",
+        type=_picture,
+        default=default,
+        metavar="F",
+        help=f"picture (.png, .svg or .pdf) {shows}",
+    )
+
+
 def add_html(parser: argparse.ArgumentParser, shows: str) -> None:
     """Add the option --html; `check_html` checks before the work whether it is available."""
-    parser.add_argument("--html", metavar="F", help=f"{shows}; a single file that works offline")
+    parser.add_argument(
+        "--html", metavar="F", help=f"HTML {shows}; a single file that works offline"
+    )
 
 
 def check_html(options: argparse.Namespace) -> None:
@@ -133,6 +148,13 @@ def natural(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be a non-negative whole number, got {text!r}")
     return value
+
+
+def _picture(text: str) -> str:
+    """Return the name of a picture that matplotlib can write, for argparse."""
+    if not text.lower().endswith(_PICTURES):
+        raise argparse.ArgumentTypeError(f"must end in {', '.join(_PICTURES)}, got {text!r}")
+    return text
 
 
 def print_files(**files: str | None) -> None:

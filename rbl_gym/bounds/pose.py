@@ -65,9 +65,10 @@ def inverted(information: FloatArray, more: str) -> FloatArray:
     rank = information_rank(information)
     if (rank < 6).any():
         where = tuple(int(i) for i in np.argwhere(rank < 6)[0])
+        at = f" at index {where}" if where else ""
         raise ValueError(
             "the geometry does not determine the pose: its information has rank "
-            f"{int(rank.min())} of 6 at batch index {where}; add {more}, or give prior_information"
+            f"{int(rank.min())} of 6{at}; add {more}, or give prior_information"
         )
     return np.linalg.inv(information)
 

@@ -101,7 +101,7 @@ class BaseStationVectorEnv(BatchEnv):
         scenes: Any = None,
     ) -> None:
         if scenes is not None and scene is not None:
-            raise ValueError(f"scene must be left out with scenes, got {scene!r:.80}")
+            raise ValueError(f"scene must be left out if scenes is given, got {scene!r:.80}")
         self.family = None if scenes is None else family_of_worlds(scenes)
         self._scene = world(scene) if self.family is None else self.family.corners[0]
         worlds = self.family or self._scene

@@ -203,7 +203,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         elif isinstance(self.action_space, spaces.Box):
             check_action(action, 3 * (self.family or self.scene).n_anchors)
         elif not are_zeros(as_array("action", action), ()):
-            raise ValueError(f"action must be 0 where the anchors are fixed, got {action!r:.80}")
+            raise ValueError(f"action must be 0, as the anchors are fixed, got {action!r:.80}")
         self._epoch += 1
         observation, info, reward = self._observe()
         return observation, reward, False, self._epoch >= self.scene.steps, info
@@ -269,8 +269,8 @@ def check_reward(reward: Any, family: SceneFamily | None) -> str:
     check_one_of("reward", reward, REWARDS)
     if reward == "bound" and family is not None and family.is_surveyed:
         raise ValueError(
-            "reward must be 'none' with scenes that have survey_std_m: the states of their "
-            "bounds differ in size"
+            "reward must be 'none' if scenes have survey_std_m, as their bounds have different "
+            "numbers of states; got 'bound'"
         )
     return reward
 
@@ -312,7 +312,7 @@ def worlds_of(scene: Any, family: Any) -> tuple[SceneFamily | None, Scene]:
     if family is None:
         return None, scenes.get(scene)
     if scene != "uwb_room":
-        raise ValueError(f"scene must be left out with scenes, got {scene!r:.80}")
+        raise ValueError(f"scene must be left out if scenes is given, got {scene!r:.80}")
     found = families.family(family)
     return found, found.corners[0]
 

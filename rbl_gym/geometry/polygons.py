@@ -53,8 +53,9 @@ def check_polygon(name: str, polygon: ArrayLike) -> FloatArray:
         the position.
     """
     ring = check_line(name, polygon, closed=True)
-    extent = float(np.ptp(ring, axis=0).max())
-    if abs(area(ring)) <= TOUCH_M * extent:
+    # A polygon that crosses itself may also have no area.
+    spread = np.linalg.svd(ring - ring.mean(axis=0), compute_uv=False)
+    if spread[1] <= TOUCH_M:
         raise ValueError(
             f"{name} must enclose an area, but its {len(ring)} corners lie on one line"
         )

@@ -71,7 +71,10 @@ class DirectionLaw(NamedTuple):
                     f"of every harmonic, got {bias.shape} and {log_std.shape}"
                 )
             if not (np.isfinite(bias).all() and np.isfinite(log_std).all()):
-                raise ValueError(f"{name} and {name}_log_std must be finite")
+                both = np.concatenate([bias, log_std], axis=None)
+                raise ValueError(
+                    f"{name} and {name}_log_std must be finite, got {both[~np.isfinite(both)][0]}"
+                )
             fields.append((bias, log_std))
         (a, log_a), (b, log_b) = fields
         return cls(a, b, log_a, log_b)

@@ -353,7 +353,10 @@ def check_law(name: str, noise: Any) -> None:
     """Raise ValueError if an object does not have the methods of `NoiseLaw`."""
     methods = ("variance", "squared_range_variance", "sample")
     if not all(callable(getattr(noise, method, None)) for method in methods):
-        raise ValueError(f"{name} must have {', '.join(methods)}, got {noise!r:.80}")
+        raise ValueError(
+            f"{name} must be a noise law such as ranging.RangeNoise(floor_m=0.1), with the methods "
+            f"{', '.join(methods)}; got {noise!r:.80}"
+        )
 
 
 # Noise laws by their names in scene files and overrides.

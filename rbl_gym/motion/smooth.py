@@ -147,7 +147,10 @@ def through(
             f"{rotation.shape} and {translation.shape}"
         )
     if at.ndim != 1 or at.min() < times[0] or at.max() > times[-1]:
-        raise ValueError(f"at must lie in [{times[0]:g}, {times[-1]:g}], got {at.min():g}")
+        raise ValueError(
+            f"at must have shape (T,) and lie in [{times[0]:g}, {times[-1]:g}], got shape "
+            f"{at.shape} from {at.min():g} to {at.max():g}"
+        )
     line, turning = (
         CubicSpline(times, translation),
         RotationSpline(times, Rotation.from_matrix(rotation)),

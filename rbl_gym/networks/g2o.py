@@ -174,7 +174,7 @@ def _lines(path: str) -> Iterator[tuple[int, str]]:
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read, {error.strerror}") from error
+        raise ValueError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path}: must be UTF-8 text, {error.reason} at byte {error.start}"

@@ -129,7 +129,10 @@ def check_edge_angles(y: ArrayLike, edges: IntArray) -> FloatArray:
     """Return edge angles y (m,), or raise ValueError; very large angles are invalid."""
     array = check_edge_values("y", y, edges)
     if (np.abs(array) > _LARGEST_ANGLE).any():
-        raise ValueError(f"y must be angles in radians, got {np.abs(array).max():g}")
+        raise ValueError(
+            f"y must be angles in radians of at most {_LARGEST_ANGLE:g}, got "
+            f"{np.abs(array).max():g}"
+        )
     return array
 
 

@@ -292,7 +292,10 @@ def of_problem(
     )
     seen = scenery.of_problem(problem, judge.sample, swap)
     if KINDS[seen.kind] == "mounts" and len(seen.candidates) < count:
-        raise ValueError("anchors have no permitted place: obstacles cover all of them")
+        raise ValueError(
+            f"{count} anchors cannot be mounted: obstacles leave {len(seen.candidates)} permitted "
+            "positions"
+        )
     play = _Play(seen, judge, problem.obstacles, smooth, count)
     found = _improved(network or load(), play, evaluations, swap, later, later.legal)
     return np.concatenate([problem.fixed, found])

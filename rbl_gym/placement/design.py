@@ -120,5 +120,8 @@ def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> F
         drawn = problem.mounts.draw(rng.random((20 * count, 3)))
     free = drawn[~problem.obstacles.contain(drawn)]
     if len(free) < problem.n_anchors - len(problem.fixed):
-        raise ValueError("anchors have no permitted place: obstacles cover all of them")
+        raise ValueError(
+            f"{problem.n_anchors - len(problem.fixed)} anchors cannot be mounted: obstacles leave "
+            f"{len(free)} permitted positions"
+        )
     return free if problem.mounts.listed() is not None else free[:count]

@@ -25,7 +25,7 @@ def check_problem(problem: Problem) -> Problem:
         name = zone.name if zone.name == "region" else f"zones[{index}] ({zone.name!r})"
         _check_zone(problem, zone, name)
     if problem.obstacles.contain(problem.mounts.draw(cube(4000))).all():
-        raise ValueError("anchors have no permitted place: obstacles cover all of them")
+        raise ValueError("no anchor can be mounted: obstacles cover all permitted positions")
     check_numbers(problem)
     return problem
 
@@ -121,8 +121,8 @@ def check_numbers(problem: Problem) -> None:
     n_fixed = len(problem.fixed)
     if problem.n_anchors < n_fixed:
         raise ValueError(
-            f"the number of anchors includes the fixed ones: it must be at least {n_fixed}, the "
-            f"number of anchors.fixed, got {problem.n_anchors}"
+            f"the number of anchors must be at least {n_fixed}, the number of anchors.fixed, which "
+            f"it includes; got {problem.n_anchors}"
         )
     listed = problem.mounts.listed()
     if listed is not None and len(listed) < problem.n_anchors - n_fixed:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, check_array, check_number, did_you_mean
 from rbl_gym.geometry.polygons import check_line, check_polygon
 from rbl_gym.placement.file_keys import FORMAT, MOST_M, Form, Key
 
@@ -73,6 +73,7 @@ def check_keys(table: Mapping[str, Any], name: str, keys: Mapping[str, Key]) -> 
         if key not in keys:
             raise ValueError(
                 f"{name} has an unknown key {key!r:.80}; it may have {', '.join(keys)}"
+                f"{did_you_mean(key, keys)}"
             )
     for key, what in keys.items():
         if what.needed and key not in table:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, did_you_mean
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.geometry.polygons import TOUCH_M, check_polygon
 from rbl_gym.placement.file_keys import MATERIALS
@@ -112,7 +112,8 @@ def _share(name: str, table: Mapping[str, Any], materials: Mapping[str, float]) 
             raise ValueError(
                 f"{name}.material must be one of [materials], which has "
                 f"{', '.join(map(repr, materials)) or 'none'}, or a standard material: "
-                f"{', '.join(map(repr, MATERIALS))}; got {material!r}"
+                f"{', '.join(map(repr, MATERIALS))}; got {material!r:.80}"
+                f"{did_you_mean(material, known)}"
             )
         return known[material]
     return math.nan if share is None else share

@@ -357,7 +357,8 @@ def root_of(square: FloatArray) -> FloatArray:
     """Return scores (...) from their squares; raises ValueError if they are not finite."""
     # Also false for NaN.
     if np.count_nonzero(square > 0) < square.size or not all_finite(square):
-        raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
+        error = f"got the mean square tag error {square.max():g}"
+        raise ValueError(f"information must be positive definite and finite, {error}")
     return np.sqrt(square)
 
 

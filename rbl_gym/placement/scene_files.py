@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import placement
-from rbl_gym.checks import FloatArray, as_tuples, check_array, check_number
+from rbl_gym.checks import FloatArray, as_tuples, check_array, check_number, did_you_mean
 from rbl_gym.geometry.obstacles import Obstacles, Prisms, inside
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements.gain import Gain
@@ -197,6 +197,7 @@ def _check_tables(tables: Mapping[str, Any]) -> None:
         if key not in allowed:
             raise ValueError(
                 f"the file has an unknown key {key!r:.80}; it may have {', '.join(allowed)}"
+                f"{did_you_mean(key, allowed)}"
             )
     needed = ["body", "noise"]
     if not tables.get("mounts"):

@@ -17,6 +17,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rbl_gym.checks import did_you_mean
+
 Table = Mapping[str, Any]
 
 _EVERYWHERE = ("topic", "time", "time_unit", "where")
@@ -134,13 +136,19 @@ def check_mapping(mapping: Mapping[str, Any]) -> None:
     """Raise ValueError if a table or a key is unknown."""
     for kind, table in mapping.items():
         if kind not in KEYS:
-            raise ValueError(f"unknown table [{kind}], must be one of {[*KEYS]}")
+            raise ValueError(
+                f"table [{kind}] is unknown; the tables are {', '.join(KEYS)}"
+                f"{did_you_mean(kind, KEYS)}"
+            )
         if not isinstance(table, Mapping):
             raise ValueError(f"[{kind}] must be a table of keys and values, got {table!r:.60}")
         known = [*_EVERYWHERE, *KEYS[kind]]
         for key in table:
             if key not in known:
-                raise ValueError(f"[{kind}] unknown key {key!r}, must be one of {known}")
+                raise ValueError(
+                    f"[{kind}] has an unknown key {key!r}; it may have {', '.join(known)}"
+                    f"{did_you_mean(key, known)}"
+                )
 
 
 def sources(
@@ -172,7 +180,7 @@ def sources(
             )
         elif table:
             raise ValueError(
-                f"[{kind}] topic is missing and cannot be chosen automatically, the topics are "
+                f"[{kind}] must have the key topic, as no topic has a known type; the topics are "
                 f"{_listed(topics)}"
             )
     return found, notes
@@ -193,14 +201,21 @@ def _candidates(kind: str, topics: Mapping[str, str]) -> tuple[list[str], str]:
         if fnmatchcase(topic, pattern)
     ]
     if len(names) > 1 and len(preferred) != 1:
-        return [], f"{kind} not written, as several topics are possible: {', '.join(names)}"
+        return (
+            [],
+            f"{kind} not written, as several topics are possible, {', '.join(names)}: name one by "
+            f"--{kind} topic=NAME",
+        )
     return (preferred or names), ""
 
 
 def _matching(kind: str, pattern: str, topics: Mapping[str, str]) -> list[str]:
     names = [topic for topic in topics if fnmatchcase(topic, pattern)]
     if not names:
-        raise ValueError(f"[{kind}] no topic {pattern!r}, the topics are {_listed(topics)}")
+        raise ValueError(
+            f"[{kind}] has the topic {pattern!r}, which the log does not have; its topics are "
+            f"{_listed(topics)}{did_you_mean(pattern, topics)}"
+        )
     return names
 
 
@@ -224,7 +239,10 @@ def _filled(
     if msgtype == "tf2_msgs/msg/TFMessage" and len(full.get("where", {})) < 2:
         raise ValueError(f"[{kind}] {names[0]} has messages of many frames: give parent and child")
     if frames := [key for key in ("parent", "child") if key in full]:
-        raise ValueError(f"[{kind}] {frames[0]}: messages of type {msgtype} have no such frame")
+        raise ValueError(
+            f"[{kind}] must not have the key {frames[0]}, as messages of type {msgtype} have no "
+            "frames"
+        )
     return full
 
 

@@ -84,7 +84,7 @@ def convert_bag(
             if not len(made.times_ns) and (kind == "ranges" or kind in (mapping or {})):
                 dropped = [f"{n} dropped, {why}" for why, n in kinds[kind]["dropped"].items()]
                 raise ValueError(
-                    f"[{kind}] no message can be used: {'; '.join(dropped) or 'there is none'}"
+                    f"[{kind}] no message can be used: {'; '.join(dropped) or 'the log has none'}"
                 )
         notes += made.notes
         if values.by_recording:
@@ -200,8 +200,8 @@ def _far_stamps(kinds: Mapping[str, Mapping[str, Any]]) -> list[str]:
         return []
     told = ", ".join(f"{kind} {delay:.3f} s" for kind, delay in delays.items())
     return [
-        f"clocks differ, the stamps are behind the times of recording: {told}; time=@bag uses the "
-        "times of recording"
+        f"the clocks differ: the stamps are behind the times of recording by {told}. With the key "
+        "time=@bag the times of recording are used"
     ]
 
 

@@ -40,7 +40,10 @@ def read_differences(
     """
     table.require("t", "anchor_a", "anchor_b", *id_columns(tag=tags), "difference")
     if anchors is None:
-        raise ValueError(f"{table.path}: time differences need a table of anchors")
+        raise ValueError(
+            f"{table.path}: give the positions of the anchors (--anchors), which time differences "
+            "need"
+        )
     ids = anchors.ids, ids_of(table, "tag", tags)
     scale = scale_of(table, "difference", format, said)
     first, other = (table.positions(name, ids[0]) for name in ("anchor_a", "anchor_b"))

@@ -25,28 +25,32 @@ _CAUSES = {
     "": ("", ""),
     "empty": ("", "range"),
     "marked as not valid": ("", "valid"),
-    "repeated": ("each link may come once at a time", "range"),
+    "repeated": ("each link must have only one range at a time", "range"),
     "not a number": ("must be a finite number", "range"),
     "zero": ("range must be positive", "range"),
     "negative": ("range must be positive", "range"),
     "too long": (f"must be at most {MAX_RANGE_M:.0f} m (looks like millimetres?)", "range"),
     "far too long": ("must be at most 1e9 m", "range"),
     "without a standard deviation": ("must be positive and no longer than a range", "std"),
-    "of an unknown anchor": ("unknown anchor", "anchor"),
-    "of an unknown tag": ("unknown tag", "tag"),
-    "to an unknown anchor": ("unknown anchor", "anchor_b"),
+    "of an unknown anchor": ("anchor", "anchor"),
+    "of an unknown tag": ("tag", "tag"),
+    "to an unknown anchor": ("anchor", "anchor_b"),
     "of an anchor to itself": ("must be another anchor than anchor_a", "anchor_b"),
-    "twice with two values": ("each link may come once at a time", "range"),
-    "of an anchor without a position at that time": ("the anchor must have a position", "t"),
+    "twice with two values": ("each link must have only one range at a time", "range"),
+    "of an anchor without a position at that time": (
+        "the anchor must have a position at this time",
+        "t",
+    ),
 }
 _NAMES = [*_CAUSES]
 # Advice if one cause prevails.
 _HINTS = {
-    "too long": "are the ranges in another unit? set it",
-    "of an unknown anchor": "add this anchor to the table of anchors",
-    "of an unknown tag": "add this tag to the table of tags",
-    "twice with two values": "stamps too coarse, or several runs without a column run?",
-    "without a standard deviation": "is it in another column? name that column",
+    "too long": "are the ranges in cm or mm? set --unit",
+    "of an unknown anchor": "add it to the table of anchors",
+    "of an unknown tag": "add it to the table of tags",
+    "twice with two values": "are the stamps too coarse, or does the file have several runs and no "
+    "column run?",
+    "without a standard deviation": "is it in another column? name it by --columns std=NAME",
     "of an anchor without a position at that time": "do the clocks agree?",
 }
 _FINE = ("", "empty", "marked as not valid", "repeated")
@@ -89,8 +93,12 @@ def read_measured(
         return _read_wide(table, anchors, tags, format, said)
     if table.columns.keys().isdisjoint(("anchor", "tag", "range", "ax")):
         return _read_wide(table, anchors, tags, format, said)
-    places = ("ax", "ay") if anchors is None else ()
-    table.require("t", *id_columns(anchor=anchors, tag=tags), "range", *places)
+    if anchors is None and not {"ax", "ay"} <= table.columns.keys():
+        raise ValueError(
+            f"{table.path}: give the positions of the anchors (--anchors), or the columns ax, ay "
+            f"and az in this file; got the columns {[*table.names.values()]!r:.200}"
+        )
+    table.require("t", *id_columns(anchor=anchors, tag=tags), "range")
     read = {"t", "range", "run"}
     anchor_ids = ids_of(table, "anchor", anchors)
     if anchors is None:
@@ -140,7 +148,8 @@ def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
         ids = tuple(dict.fromkeys(table.text(column)))
         if column == "tag" and len(ids) > 1:
             raise ValueError(
-                f"{table.path}: ranges of several tags need a table of tags, got {ids!r:.200}"
+                f"{table.path}: give the positions of the tags on the body (--tags), as the ranges "
+                f"are of {len(ids)} tags, {ids!r:.200}"
             )
         return ids
     return points.ids
@@ -159,7 +168,10 @@ def _read_wide(
     """Read a table with one row per epoch and one column per link."""
     columns = format.of("ranges").columns
     if anchors is None:
-        raise ValueError(f"{table.path}: columns for links need a table of anchors")
+        raise ValueError(
+            f"{table.path}: give the positions of the anchors (--anchors), which a table with a "
+            "column for each link does not have"
+        )
     pattern = columns.get("range", _WIDE)
     links, ids = _links_of(table, pattern, anchors.ids, None if tags is None else tags.ids)
     names = list(links)
@@ -167,9 +179,11 @@ def _read_wide(
         long = [name for name in ("t", *id_columns(anchor=anchors, tag=tags), "range")
                 if name not in table.columns]  # fmt: skip
         raise ValueError(
-            f"{table.path}, line {table.header_line}: must have columns {pattern!r} of "
-            f"{ids!r:.200}, or t, anchor, tag, range; got {[*table.names.values()]!r:.200}; state "
-            f"them by --columns {table.source.given(**dict.fromkeys(long, 'NAME'))}"
+            f"{table.path}, line {table.header_line}: no column of ranges found. There must be the "
+            "columns t, anchor, tag, range, or a column for each link, named like "
+            f"{pattern.format(anchor=ids[0][0], tag=ids[1][0])!r}; got "
+            f"{[*table.names.values()]!r:.200}; name them by "
+            f"--columns {table.source.given(**dict.fromkeys(long, 'NAME'))}"
         )
     table.require("t")
     scale = scale_of(table, "range", format, said)
@@ -183,8 +197,8 @@ def _read_wide(
         if "" in std_names:
             name = names[std_names.index("")]
             raise ValueError(
-                f"{table.path}, line {table.header_line}: no column like {columns['std']!r} "
-                f"for {name!r}"
+                f"{table.path}, line {table.header_line}: column {name!r} of ranges must have a "
+                f"column of standard deviations like {columns['std']!r}, got none"
             )
         std = np.stack([table.numbers(n, may_be_missing=True) for n in std_names], axis=1)
         std = scale * std.ravel()
@@ -219,14 +233,15 @@ def _links_of(
             name = pattern.replace("{anchor}", anchor).replace("{tag}", tag)
             if name in links:
                 raise ValueError(
-                    f"{table.path}: column {name!r} fits two links, use a table with columns t, "
-                    "anchor, tag, range"
+                    f"{table.path}: the name of column {name!r} fits two links: use a table with "
+                    "columns t, anchor, tag, range"
                 )
             if name in table.columns:
                 links[name] = a, b
     if "{tag}" not in pattern and len(tags) > 1:
         raise ValueError(
-            f"columns {pattern!r} name no tag, but there are several tags: {tags!r:.200}"
+            f"columns of links must have {{tag}} in their names, as there are {len(tags)} tags, "
+            f"{tags!r:.200}; got {pattern!r}"
         )
     return links, (anchors, tags)
 
@@ -242,7 +257,8 @@ def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[s
         found |= {m[1]: None for name in table.columns if (m := like.fullmatch(name))}
     if len(found) > 1:
         raise ValueError(
-            f"{table.path}: ranges of several tags need a table of tags, got {[*found]!r:.200}"
+            f"{table.path}: give the positions of the tags on the body (--tags), as the ranges are "
+            f"of {len(found)} tags, {[*found]!r:.200}"
         )
     return tuple(found) or ("0",)
 
@@ -300,10 +316,10 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
     if (count := sum(bad.values())) > _MOST_BAD * total:
         causes = ", ".join(f"{n} {cause}" for cause, n in bad.items())
         worst = max(bad, key=lambda cause: bad[cause])
-        hint = f" ({_HINTS[worst]})" if worst in _HINTS else ""
+        hint = f"; {_HINTS[worst]}" if worst in _HINTS else ""
         raise ValueError(
-            f"{table.path}: {count} of {total} ranges cannot be used: {causes}; at most a fifth "
-            f"may be unusable{hint}. The first: {_first(measured, table, ids, refused)}"
+            f"{table.path}: {count} of {total} ranges cannot be used ({causes}), more than the "
+            f"fifth that is allowed. The first: {_first(measured, table, ids, refused)}{hint}"
         )
     if shown := {c: n for c, n in counts.items() if c not in ("", "empty", "marked as not valid")}:
         causes = ", ".join(
@@ -334,10 +350,13 @@ def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str
     name = name[measured.column[at]] if len(name) > 1 else name[0]
     name = "anchor_a" if name == "anchor" and "anchor_a" in table.columns else name
     got = repr(table.columns[name][row])
-    if column in ("anchor", "tag"):
-        must += f", must be one of {ids[column == 'tag']!r:.200}"
-    if "once" in must:
-        got = f"{got} of {ids[0][measured.anchor[at]]!r} and {ids[1][measured.tag[at]]!r} again"
+    if "unknown" in cause:
+        must += f" must be one of {', '.join(ids[column == 'tag'])!s:.200}"
+    if "only one" in must:
+        got = (
+            f"{got} beside an earlier range of anchor {ids[0][measured.anchor[at]]!r} and tag "
+            f"{ids[1][measured.tag[at]]!r}"
+        )
     return f"{table.place(row, name)}: {must}, got {got:.80}"
 
 

@@ -98,7 +98,7 @@ def _of_axes(table: Table, unit: float) -> tuple[FloatArray, tuple[str, ...]]:
         raise ValueError(
             f"{table.path}, line {table.header_line}: must have some of the columns "
             f"{', '.join(_COLUMNS)}, or left and right, got {[*table.names.values()]!r:.200}; "
-            "state them by --columns odometry.vx=NAME,..."
+            "if they have other names, give --columns odometry.vx=NAME,..."
         )
     readings = np.full((len(table.lines), 6), np.nan)
     for name in names:

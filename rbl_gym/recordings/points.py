@@ -50,17 +50,17 @@ def read_points(path: AnyPath, kind: str, source: Source, said: Said) -> Points:
     column = kind if kind in table.columns or "id" not in table.columns else "id"
     axes = [axis for axis in "xyz" if axis in table.columns]
     if axes == ["x", "y"] and len(table.columns) == 3 + ("t" in table.columns):
-        said.note(table.path, "has no column z, heights are 0")
+        said.note(table.path, "there is no column z, so the heights are 0")
     else:
         axes = [*"xyz"]
     table.require(column, *axes)
     ids = table.text(column)
-    table.check(np.array([*map(bool, ids)]), column, "id must not be empty")
+    table.check(np.array([*map(bool, ids)]), column, f"every {kind} must have an id")
     places = table.points(axes, MAX_TAG_M if kind == "tag" else MAX_COORDINATE_M)
     places = np.pad(places, ((0, 0), (0, 3 - len(axes))))
     once = is_first(ids)
     if once.all() or kind == "tag" or "t" not in table.columns:
-        table.check(once, column, "id must be unique")
+        table.check(once, column, f"every {kind} must have its own id")
         said.read(table, (column, *axes))
         return Points(tuple(ids), places)
     said.read(table, (column, *axes, "t"))

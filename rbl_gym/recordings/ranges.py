@@ -95,7 +95,7 @@ def read_log(
             said.drop("of anchors without a connection to the others", lost)
             said.note(
                 table.path,
-                f"{lost} time differences are left out, as their anchors have no connection to "
+                f"{lost} time differences are left out, as no difference connects their anchors to "
                 "the others",
             )
         return _leveled(Log(epochs, ranges, links, std, anchors, places, tags, "tag"), table)
@@ -125,8 +125,8 @@ def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, s
     table.check(
         late <= allowed + 1e-9,
         "t",
-        f"time must not fall by more than {allowed:g} s from row to row (several runs in one file "
-        "need a column run; or set the time unit)",
+        f"time must not decrease by more than {allowed:g} s from row to row (several runs in one "
+        "file need a column run; if the unit is wrong, set --time-unit)",
     )
     if count := int((late > 0).sum()):
         said.sorted_rows += count
@@ -139,7 +139,7 @@ def _anchors_beside(
     """Return the anchors whose positions are columns of the table, and the anchor of each range."""
     axes = ["ax", "ay", *(["az"] if "az" in table.columns else [])]
     if len(axes) == 2:
-        said.note(table.path, "has no heights of the anchors, they are 0")
+        said.note(table.path, "there is no column az, so the heights of the anchors are 0")
     places = np.pad(table.points(axes), ((0, 0), (0, 3 - len(axes))))
     anchor = measured.anchor
     if "anchor" not in table.columns:

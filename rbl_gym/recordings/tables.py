@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import BoolArray, FloatArray, did_you_mean
 from rbl_gym.recordings.stamps import TIME_UNITS, found_unit, iso_seconds, seconds_per
 from rbl_gym.recordings.text import is_number, read_cells
 
@@ -93,7 +93,8 @@ class Table(NamedTuple):
         )
         if self.source.file:
             names = self.source.given(**dict.fromkeys(missing, "NAME"))
-            text += f"; state {'them' if several else 'it'} by --columns {names}"
+            other = "they have other names" if several else "it has another name"
+            text += f"; if {other}, give --columns {names}"
         raise ValueError(text)
 
     def name(self, column: str) -> str:
@@ -118,7 +119,9 @@ class Table(NamedTuple):
         """Raise at the first row where `ok` is False; `got` replaces the cells in the message."""
         if not ok.all():
             row = int(np.argmin(ok))
-            value = repr(self.columns[column][row]) if got is None else str(got[row])
+            value = repr(self.columns[column][row]) if got is None else f"{got[row]}"
+            if got is not None and isinstance(got[row], float):
+                value = f"{got[row]:.6g}"
             raise ValueError(f"{self.place(row, column)}: {must}, got {value:.80}")
 
     def select(self, rows: BoolArray) -> Table:
@@ -206,7 +209,7 @@ class Table(NamedTuple):
         found = []
         for column, known in zip(("anchor", "tag"), ids, strict=True):
             found.append(self.positions(column, known))
-            self.check(found[-1] >= 0, column, f"unknown {column}, must be one of {known!r:.200}")
+            self.check(found[-1] >= 0, column, f"{column} must be one of {', '.join(known)!s:.200}")
         pairs = [*zip(self.columns["anchor"], self.columns["tag"], strict=True)]
         once = is_first(found[0] * len(ids[1]) + found[1])
         self.check(once, "tag", "each link must be in the table once", got=pairs)
@@ -235,7 +238,7 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
         units[header[-1]] = units_of
     if not (first := is_first(header)).all():
         name = header[first.argmin()]
-        raise ValueError(f"{where}: column {name!r} comes twice")
+        raise ValueError(f"{where}: two columns have the name {name!r}: rename one")
     by_name = dict(zip(header, cells.columns, strict=True))
     said = {role: _name_and_unit(name) for role, name in source.columns.items()}
     names = _roles(where, header, {role: name for role, (name, _) in said.items()}, source)
@@ -293,13 +296,13 @@ def _roles(
     if pattern is not None:
         before, star, after = pattern.partition("*")
         if not star:
-            raise ValueError(f"{where}: a column named * needs a pattern with a *, got {pattern!r}")
+            raise ValueError(f"{where}: the value of * must have a *, as in *=B_*, got {pattern!r}")
         for name in header:
             if name.startswith(before) and name.endswith(after) and len(name) > len(pattern) - 1:
                 names[name[len(before) : len(name) - len(after)]] = name
         if not names:
             raise ValueError(f"{where}: no column fits {pattern!r}, got {header!r:.200}")
-    absent = []
+    absent, near = [], ""
     for role, name in columns.items():
         if "{" in name:
             continue  # a pattern of links
@@ -307,13 +310,14 @@ def _roles(
             if role in header and role not in _QUANTITIES and name in _QUANTITIES:
                 swapped = source.given(**{name: role})
                 raise ValueError(
-                    f"{where}: {role!r} is not a known quantity; did you mean {swapped}?"
+                    f"{where}: {role!r} is not the name of a quantity; did you mean {swapped}?"
                 )
             absent.append(f"{name!r} for {role}")
+            near = near or (role not in _QUANTITIES and did_you_mean(role, _QUANTITIES)) or ""
         names[role] = name
     if absent:
         word = "column" if len(absent) == 1 else "columns"
-        raise ValueError(f"{where}: missing {word} {', '.join(absent)}, got {header!r:.200}")
+        raise ValueError(f"{where}: missing {word} {', '.join(absent)}, got {header!r:.200}{near}")
     taken = set(names.values())
     for role, others in _OTHER_NAMES.items():
         if role in names or role in header:

@@ -60,7 +60,7 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
     count = 0 if first < 0 else 1 if second < 0 else 2
     above = range(0 if first < 0 else first)
     if first < 0:
-        raise ValueError(f"{path}: must have a header and rows, got 0 lines")
+        raise ValueError(f"{path}: must have the names of the columns and rows, got none")
     comma = _delimiter(lines[first], lines[second] if count == 2 else lines[first])
     start, header = first, _split(lines[first], comma)
     if numbered and any(map(_is_numeric, header)):
@@ -79,12 +79,12 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
                 not _is_numeric(a) and _is_numeric(b) for a, b in zip(header, row, strict=False)
             ):
                 raise ValueError(
-                    f"{path}, line {first + 1}: must name the columns, got {lines[first]!r:.80}; "
-                    "no comment above it names them either"
+                    f"{path}, line {first + 1}: must have the names of the columns, got "
+                    f"{lines[first]!r:.80}"
                 )
     rows, numbers, cut = _rows(path, lines, start, header, comma)
     if not rows:
-        raise ValueError(f"{path}: must have a header and rows, got only one line")
+        raise ValueError(f"{path}: must have rows below the names of the columns, got none")
     decimal = "."
     if comma != "," and _DECIMAL_COMMA.search(text := "\n".join(lines[first:])):
         decimal = ","
@@ -153,9 +153,11 @@ def _read_lines(path: str) -> list[str]:
     try:
         return Path(path).read_text(encoding="utf-8-sig").split("\n")
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read, {error.strerror}") from error
+        raise ValueError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be UTF-8 text, {error.reason} at {error.start}") from error
+        raise ValueError(
+            f"{path}: must be UTF-8 text, {error.reason} at byte {error.start}"
+        ) from error
 
 
 def _delimiter(header: str, row: str) -> str | None:

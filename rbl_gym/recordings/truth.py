@@ -167,7 +167,7 @@ def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
         elif angle in table.columns:
             text = (
                 f"{table.path}, line {table.header_line}: column {table.name(angle)!r} must state "
-                f"its unit: name it {angle}_deg or {angle}_rad"
+                f"its unit: rename it {angle}_deg or {angle}_rad"
             )
             if table.source.file:
                 given = (table.source.given(**{f"{angle}_{unit}": table.name(angle)})

@@ -56,10 +56,14 @@ def check_units(
     # A single anchor, or anchors at one position, contain no information on the scale.
     scale = typical / layout if layout > 1e-6 and anchors_are == "stand" else 1.0
     if not 1 / _MAX_SCALE_RATIO <= scale <= _MAX_SCALE_RATIO:
-        hint = " (ranges in cm or mm? set --unit)" if scale > 1 else ""
+        hint = (
+            "are the ranges in cm or mm? set --unit"
+            if scale > 1
+            else f"are the positions in {paths[1]} in cm or mm?"
+        )
         raise ValueError(
             f"{paths[0]}: units look inconsistent, the median range is {typical:.4g} m and "
-            f"the anchors lie {layout:.4g} m from their centre{hint}"
+            f"the anchors lie {layout:.4g} m from their centre: {hint}"
         )
     newest, fresh = _held(times, ranges, links)
     _check_spread(paths[2], tags, anchors, newest, fresh, typical)
@@ -109,8 +113,8 @@ def _check_pairs(
         if np.median(total / apart) < _SUM:
             raise ValueError(
                 f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart, "
-                f"but the sum of the ranges to two of them is {np.median(total):.4g} m "
-                "(looks like centimetres or millimetres?)"
+                f"but the ranges to two of them have a sum of only {np.median(total):.4g} m: are "
+                f"the positions of the {name} in cm or mm?"
             )
     some = slice(None, None, 1 + len(ranges) // _EPOCHS)
     ranges, links = ranges[some], links[some]
@@ -121,7 +125,8 @@ def _check_pairs(
         if np.median(gap / apart) > _TOO_NEAR and np.median(gap) > _NOISE * typical:
             raise ValueError(
                 f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart, "
-                f"but the ranges to them differ by {np.median(gap):.4g} m"
+                f"but the ranges to them differ by {np.median(gap):.4g} m: are the positions and "
+                "the ranges in the same unit?"
             )
 
 
@@ -150,9 +155,9 @@ def _check_spread(
     if seen < _BROADSIDE:
         raise ValueError(
             f"{path}: units look inconsistent, tags are up to {distance.max():.4g} m apart, "
-            f"but the ranges of an anchor to two tags differ by {100 * seen:.2g} % of the distance "
-            "of the tags, or less "
-            f"(looks like {'millimetres' if seen < _MILLI else 'centimetres'}?)"
+            "but the ranges of an anchor to two tags differ by at most "
+            f"{100 * seen:.2g} % of this: are the positions of the tags in "
+            f"{'mm' if seen < _MILLI else 'cm'}?"
         )
 
 

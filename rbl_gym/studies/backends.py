@@ -103,7 +103,7 @@ def _surviving(
                 left = ", ".join(str(tasks[index]) for index in sorted(open_)[:jobs])
                 raise ChildProcessError(
                     f"workers died {_PATIENCE} times in a row with {len(open_)} tasks left, "
-                    f"among them {left:.300}: try fewer processes, in case memory was short"
+                    f"among them {left:.300}: if memory ran out, use fewer processes"
                 ) from error
 
 
@@ -141,7 +141,7 @@ def _dask(
             yield from _finished(function, tasks, list(range(len(tasks))), n_jobs=-1)
         except distributed.KilledWorker as error:
             raise ChildProcessError(
-                f"workers died repeatedly, in case memory was short try fewer: {error}"
+                f"workers died repeatedly: if memory ran out, use fewer workers ({error})"
             ) from error
 
 

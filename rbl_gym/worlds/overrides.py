@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from rbl_gym.checks import check_one_of
+from rbl_gym.checks import check_one_of, did_you_mean
 from rbl_gym.geometry.regions import REGIONS, Box
 from rbl_gym.measurements.noise_laws import NOISE_FORMS, NOISE_LAWS
 
@@ -38,6 +38,7 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         if key not in fields:
             raise ValueError(
                 f"{path} has no field {key!r}; its fields are {', '.join(sorted(fields))}"
+                f"{did_you_mean(key, fields)}"
             )
         old = getattr(base, key)
         if key in _READ_BY_THEMSELVES:
@@ -60,7 +61,8 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
     if "kind" not in value:
         if not dataclasses.is_dataclass(old):
             raise ValueError(
-                f"{path} must be a value, not a dict of fields, got {dict(value)!r:.80}"
+                f"{path} must be one value, got the dict {dict(value)!r:.80} (values to draw from "
+                "are allowed only in scenes)"
             )
         return replace(old, value, path)
     if not kinds:

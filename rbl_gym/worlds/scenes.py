@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import as_tuples, check_array, imported
+from rbl_gym.checks import as_tuples, check_array, did_you_mean, imported
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
@@ -253,7 +253,7 @@ def _named(name: Any) -> Scene:
     if not isinstance(name, str) or name not in SCENES:
         raise ValueError(
             f"scene must be one of {', '.join(map(repr, SCENES))}, or a .toml or .json file; got "
-            f"{name!r:.80}"
+            f"{name!r:.80}{did_you_mean(name, SCENES)}"
         )
     return SCENES[name]
 

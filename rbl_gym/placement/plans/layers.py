@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbl_gym.checks import did_you_mean
 from rbl_gym.geometry.polygons import area, contains
 from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.plans.drawing import Drawing, Shape
@@ -85,8 +86,9 @@ def building(
         layers = [name for name in drawing.layers() if _matches(name, use.layer)]
         if not layers:
             raise ValueError(
-                f"{drawing.path}: no layer is called {use.layer!r}; there are "
-                f"{', '.join(map(repr, drawing.layers()))}"
+                f"{drawing.path}: no layer is called {use.layer!r}; the layers are "
+                f"{', '.join(map(repr, drawing.layers())):.500}"
+                f"{did_you_mean(use.layer, drawing.layers())}"
             )
         for layer in layers:
             # The first match counts, so that a name can precede a pattern such as A-*.
@@ -268,7 +270,8 @@ class _Maker:
             if "information" not in values:
                 raise ValueError(
                     f"{self.drawing.path}: layer {use.layer}: material must be one of "
-                    f"{', '.join(MATERIALS)}, got {other!r}; for any other, information=SHARE"
+                    f"{', '.join(MATERIALS)}, got {other!r:.80}; for another material give "
+                    "information=SHARE, the share (0 to 1) that remains behind it"
                 )
         elif "material" in values and "information" in values:
             values.pop("information" if "material" in said else "material")

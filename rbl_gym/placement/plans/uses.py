@@ -60,8 +60,8 @@ def parse_use(kind: str, text: str) -> Use:
     ):
         raise ValueError(
             f"--{kind} {layer}: material must be one of {', '.join(MATERIALS)}, got "
-            f"{values['material']!r}; for any other, information=SHARE, the share that a crossing "
-            "leaves"
+            f"{values['material']!r}; for another material give information=SHARE, the share (0 to "
+            "1) that remains behind it"
         )
     return Use(kind, layer, values)
 

@@ -53,7 +53,8 @@ def scene_specs(names: Sequence[str]) -> dict[str, str | dict[str, Any]]:
         try:
             leaderboard.digest_of(specs[label])
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}: {error}") from error
+            at = "" if str(error).startswith(f"{path}:") else f"{path}: "
+            raise ValueError(f"{at}{error}") from error
     return specs
 
 
@@ -70,9 +71,12 @@ def read_spec(path: Path) -> dict[str, Any]:
         spec = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from error
+    if isinstance(spec, dict) and "body" in spec:
+        return {"name": str(path)}  # a building file, which `scenes.get` reads
     if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
         raise ValueError(
-            f"{path}: must have the key 'name' of a scene, or the files of a recording"
+            f"{path}: must have either the key 'name' (changes of a scene) or the key 'ranges' (a "
+            "recording), or be a building file"
         )
     for key in FILES if "ranges" in spec else ():
         if not isinstance(spec.get(key, ""), str):

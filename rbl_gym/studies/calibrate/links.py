@@ -132,8 +132,8 @@ def calibrate_links(
     links = log.links & path_at(log, settings, shift)[1][:, None, None]
     if not links.any():
         raise ValueError(
-            f"no range has truth within {settings.truth_gap_s:g} s: see time_offset, truth_gap_s "
-            "and truth_exclude"
+            f"no range has truth within {settings.truth_gap_s:g} s: {_spans(log.runs[0])}; see "
+            "time_offset, truth_gap_s and truth_exclude"
         )
     biases = settings.biases
     if biases == "auto":
@@ -165,6 +165,13 @@ def calibrate_links(
         fit = fit._replace(tags_std_m=np.where(told, np.hypot(fit.tags_std_m, found.spread_m), 0.0))
     advance()
     return _result(log, settings, model, fit, clock, shift, found)
+
+
+def _spans(run: Recording) -> str:
+    """Return the times of the ranges and of the truth of a run, as text."""
+    assert run.truth is not None
+    spans = [f"{times[0]:.10g} to {times[-1]:.10g} s" for times in (run.times, run.truth.times)]
+    return f"ranges {spans[0]}, truth {spans[1]}"
 
 
 def _with_clock(

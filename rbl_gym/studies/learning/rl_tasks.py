@@ -79,7 +79,7 @@ class RlTask:
         if scene is None and scenes is None:
             return self
         if scene is not None and scenes is not None:
-            raise ValueError("scene must be left out with scenes")
+            raise ValueError("scene must be left out if scenes is given")
         given = {"scene": scene} if scenes is None else {"scenes": scenes}
         kept = {k: v for k, v in self.arguments.items() if k not in ("scene", "scenes")}
         return dataclasses.replace(self, arguments={**kept, **given})

@@ -107,7 +107,7 @@ def place_anchors(problem: Problem, question: Question, advance: Advance = silen
     check_one_of("start", question.start, design.STARTS)
     if question.start != "search" and (question.fewest or question.layout is not None):
         raise ValueError(
-            f"start must be 'search' with a layout or with fewest, got {question.start!r}"
+            f"start must be 'search' if layout or fewest is given, got {question.start!r}"
         )
     problem, start = _with_kept(problem, question)
     seed, survive = question.seed, question.survive
@@ -146,11 +146,11 @@ def _with_kept(problem: Problem, question: Question) -> tuple[Problem, FloatArra
     layout = question.layout
     if layout is None:
         if question.keep or question.optimise:
-            raise ValueError("a layout must be given to keep some of it, or to start from it")
+            raise ValueError("keep and optimise need a layout, got None")
         return problem, None
     if not question.optimise:
         if question.keep:
-            raise ValueError("keep needs optimise: a layout that is only judged stays as it is")
+            raise ValueError("keep needs optimise: without it no anchor of the layout moves")
         return problem, layout
     kept = [k for k in range(len(layout)) if k in question.keep or _is_in(layout[k], problem.fixed)]
     apart = [place for place in problem.fixed if not _is_in(place, layout)]

@@ -211,8 +211,8 @@ def fewest_anchors(
     """
     if not any(limits_of(zone).any() for zone in problem.zones):
         raise ValueError(
-            "the least number of anchors needs a zone with a requirement: [[zones]] with "
-            "position_m, height_m or heading_deg"
+            "fewest needs a requirement: a building file with [[zones]] that have position_m, "
+            "height_m or heading_deg"
         )
     keep = len(problem.fixed)
     rng = np.random.default_rng([seed, 6])

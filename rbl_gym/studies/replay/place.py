@@ -61,15 +61,16 @@ def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
         mean = float(recording.anchors[..., seen, 2].mean())
         if low[2] >= mean:
             raise ValueError(
-                f"volume must reach below the anchors' mean height of {mean:.4g} m with "
-                f"below_anchors, got zmin {low[2]:g}"
+                f"volume must have zmin below {mean:.4g} m, the anchors' mean height, as "
+                f"below_anchors is set; got zmin {low[2]:g}"
             )
         high[2] = min(high[2], mean)
     reach = reach_of(recording)
     if (np.array(low) > reach[1]).any() or (np.array(high) < reach[0]).any():
         raise ValueError(
-            f"volume must be in reach of the anchors, between {np.round(reach[0], 1).tolist()} and "
-            f"{np.round(reach[1], 1).tolist()} m, got {settings.knowledge.volume}"
+            "volume must overlap with the space that the anchors reach, from "
+            f"{np.round(reach[0], 1).tolist()} to {np.round(reach[1], 1).tolist()} m, got "
+            f"{low} to {high}"
         )
     return np.array([low, high])
 
@@ -144,8 +145,9 @@ def height_offset(recording: Recording, settings: Settings) -> float:
     told = (known.height_offset_m, known.height_m, known.start)
     if known.planar and all(x is None for x in told) and np.ptp(heights) > _PLANE_M:
         raise ValueError(
-            "height_offset_m (of the tags' mean height below the anchors' mean height) or "
-            f"height_m must be given, as the anchors have heights of {heights.min():g} to "
+            "height_m (height of the body) or height_offset_m (depth of the tags below the "
+            "anchors, difference of the mean heights) must be given: planar ranges do not "
+            f"determine the height, and the anchors are at {heights.min():g} to "
             f"{heights.max():g} m"
         )
     return settings.knowledge.height_offset_m or 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from rbl_gym.checks import check_number, check_one_of
+from rbl_gym.checks import check_number, check_one_of, did_you_mean
 from rbl_gym.estimators.filter import filter_text, parse_filter
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.recordings.align import ALIGNMENTS
@@ -155,12 +155,16 @@ class Knowledge:
                 check_number(name, getattr(self, name), low=1e-6)
                 if self.planar:
                     raise ValueError(
-                        f"{name} must be left out with planar, which holds height, roll and pitch"
+                        f"{name} must be left out with planar, where height, roll and pitch are "
+                        "constant"
                     )
         if self.height_m is not None:
             check_number("height_m", self.height_m)
             if self.height_std_m is None and not self.planar:
-                raise ValueError("height_m needs height_std_m, or planar, which holds the height")
+                raise ValueError(
+                    "height_m needs height_std_m, its standard deviation, or planar, with which "
+                    "the height is exact"
+                )
             if self.height_offset_m:
                 raise ValueError(
                     "height_m and height_offset_m must not both be given: they set the same height"
@@ -327,6 +331,7 @@ class Settings:
         if unknown:
             raise ValueError(
                 f"settings have no field {unknown[0]!r}; the fields are {', '.join(known)}"
+                f"{did_you_mean(unknown[0], known)}"
             )
         # The options belong to the previous filter.
         options = dict(

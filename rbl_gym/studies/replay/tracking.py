@@ -208,15 +208,22 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
         filter does not support.
     """
     if (recording.inertial is None) == (settings.filter == "iekf-imu"):
-        what = "iekf-imu needs imu" if recording.inertial is None else "only iekf-imu uses imu"
-        raise ValueError(f"{what}, got the filter {settings.filter!r}")
+        if recording.inertial is None:
+            raise ValueError("filter 'iekf-imu' needs imu, the readings of an inertial sensor")
+        raise ValueError(
+            f"imu needs the filter 'iekf-imu', got {settings.filter!r}: leave out filter or imu"
+        )
     if recording.odometry is not None and settings.filter != "iekf-log":
-        raise ValueError(f"only the filter iekf-log uses odometry, got {settings.filter!r}")
+        raise ValueError(
+            f"odometry needs the filter 'iekf-log', got {settings.filter!r}: leave out filter or "
+            "odometry"
+        )
     options = _options(recording, settings)
     if recording.directions is not None:
         if settings.filter not in _DIRECTED:
             raise ValueError(
-                f"only the filters {', '.join(_DIRECTED)} use directions, got {settings.filter!r}"
+                f"directions needs one of the filters {', '.join(_DIRECTED)}, got "
+                f"{settings.filter!r}"
             )
         options["directions"] = recording.directions
     options |= dict(settings.filter_options)

@@ -1,0 +1,74 @@
+"""The parser of the command line: errors of one line, and help whose words stay whole."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import textwrap
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from rbl_gym.checks import did_you_mean
+
+_CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")
+
+
+class _Help(argparse.HelpFormatter):
+    """Help that never breaks a name at its hyphens, such as --metres-per-pixel."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        """Wrap each line of a description; a list in it stays a list."""
+        return "\n".join(
+            textwrap.fill(
+                line,
+                width,
+                initial_indent=indent,
+                subsequent_indent=indent,
+                break_on_hyphens=False,
+            )
+            for line in text.splitlines()
+        )
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, with a suggestion for a misspelt name."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**{"formatter_class": _Help, **kwargs})
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Parse; raise an error here for an unknown option, so that it names the command."""
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            name = unknown[0].partition("=")[0]
+            near = did_you_mean(name, [*self._option_string_actions]) if name[:1] == "-" else ""
+            self.error(f"unknown argument {unknown[0]!r}{near}")
+        return options, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message in one line, without the usage, and exit with status 2."""
+        if found := _CHOICE.search(message):
+            message += did_you_mean(found[1], [name.strip("'") for name in found[2].split(", ")])
+        end = "" if message[-1] in ".?" else "."
+        self.exit(2, f"{self.prog}: {message}{end} Help: {self.prog} --help\n")
+
+
+def with_options(message: str, given: argparse.Namespace, arguments: Sequence[str]) -> str:
+    """Return the message of a library function with the options in place of its arguments.
+
+    ``range_std_m must be positive`` becomes ``--range-std-m must be positive``. The name of a file,
+    a column or a value in quotes stays, and so does a single word that was not given as an option.
+    """
+    names = [name for name in vars(given) if "_" in name]
+    words = "|".join(name for name in vars(given) if "_" not in name)
+    typed = {argument.partition("=")[0] for argument in arguments}
+    if f"--{message.partition(' ')[0]}" in typed:
+        message = f"--{message}"
+    message = re.sub(rf"(?<=needs )(?:{words})\b", r"--\g<0>", message)
+    for name in names:
+        option = f"--{name.replace('_', '-')}"
+        message = re.sub(rf"(?<![\w'\"./\[-]){name}(?![\w'\"./=])", option, message)
+    return message
