@@ -149,7 +149,7 @@ def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     assert errors[1] < 0.7 * errors[0]
     wrong = ["--filter", "iekf", "--directions", str(out / "directions.csv")]
     assert main(["replay", *logs, "--planar", *wrong]) == 2
-    assert "only the filters iekf-log" in capsys.readouterr().err
+    assert "directions needs one of the filters iekf-log" in capsys.readouterr().err
     assert main(["calibrate", *logs[:8], *wrong[2:]]) == 2
     assert "leave out --directions" in capsys.readouterr().err
 

@@ -407,5 +407,5 @@ def test_filters_whose_states_differ_in_size_go_one_by_one():
     envs: Any = gym.make_vec(
         "rbl_gym:RBL/MobileAnchors-v0", num_envs=4, scenes=CRAFT, filter="iekf-bias"
     )
-    with pytest.raises(ValueError, match=r"states of one size .* vectorization_mode='sync'"):
+    with pytest.raises(ValueError, match=r"states of the same shape .* vectorization_mode='sync'"):
         envs.reset(seed=5)

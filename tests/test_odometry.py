@@ -355,7 +355,7 @@ def test_tuning_finds_the_noise_of_the_odometry():
 
 
 def test_other_filters_do_not_read_odometry():
-    with pytest.raises(ValueError, match="only the filter iekf-log uses odometry"):
+    with pytest.raises(ValueError, match="odometry needs the filter 'iekf-log'"):
         replay.replay_recording(a_log(K=20), replay.Settings.of(filter="iekf"))
 
 

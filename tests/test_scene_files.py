@@ -288,7 +288,7 @@ def test_what_is_wrong_in_a_file_is_named(path, value, message):
 def test_anchors_without_a_legal_place():
     tables = changed("anchors", {"kind": "box", "low": [0, 0, 3], "high": [2, 2, 3], "number": 4})
     tables["obstacles"] = [{"low": [-1, -1, 2.5], "high": [3, 3, 4]}]
-    with pytest.raises(ValueError, match="anchors have no permitted place"):
+    with pytest.raises(ValueError, match="no anchor can be mounted"):
         scene_files.of_mapping(tables)
 
 

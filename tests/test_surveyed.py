@@ -157,7 +157,7 @@ def test_families_have_surveys_too(mode):
 
 def test_families_with_a_survey_have_no_bound():
     for env in (TrackingEnv, TrackingVectorEnv):
-        with pytest.raises(ValueError, match="reward must be 'none' with scenes that have survey"):
+        with pytest.raises(ValueError, match="reward must be 'none' if scenes have survey"):
             env(scenes=FAMILY)
     with pytest.raises(ValueError, match=r"bodies\[0\] must have survey_std_m = 0"):
         gym.make("rbl_gym:RBL/SharedAnchors-v0", scene={"name": "hall", "survey_std_m": 0.1})

@@ -178,10 +178,11 @@ def _read_wide(
     if not names:
         long = [name for name in ("t", *id_columns(anchor=anchors, tag=tags), "range")
                 if name not in table.columns]  # fmt: skip
+        example = pattern.replace("{anchor}", ids[0][0]).replace("{tag}", ids[1][0])
         raise ValueError(
             f"{table.path}, line {table.header_line}: no column of ranges found. There must be the "
             "columns t, anchor, tag, range, or a column for each link, named like "
-            f"{pattern.format(anchor=ids[0][0], tag=ids[1][0])!r}; got "
+            f"{example!r}; got "
             f"{[*table.names.values()]!r:.200}; name them by "
             f"--columns {table.source.given(**dict.fromkeys(long, 'NAME'))}"
         )
