@@ -14,7 +14,7 @@ from rbl_gym.estimators.linear import engines, least_squares, unitary
 from rbl_gym.geometry import obstacles, regions, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
 from rbl_gym.metrics import Figures
-from rbl_gym.motion import kinematics
+from rbl_gym.motion import kinematics, trajectories
 from rbl_gym.placement import Gain, gradient
 from rbl_gym.placement import problem as placement
 from rbl_gym.worlds import simulation
@@ -122,13 +122,29 @@ def test_ranges_of_an_anchor_on_a_tag(law):
 
 
 @every_batch
-def test_along(batch):
+def test_distances(batch):
+    world = World(batch)
+    assert_equal_forms(
+        ranging.true_distances, world.rotation, world.translation, world.tags, world.anchors
+    )
+
+
+@every_batch
+def test_twists_along_way_points(batch):
     rng = np.random.default_rng(0)
     points = rng.integers(-1, 2, (20, *batch, 6, 3)).astype(float)
     # Ends that are reached exactly, a leg without a length, and beyond the end.
     points[0, ..., 3, :] = points[0, ..., 2, :]
-    assert_equal_forms(kinematics._along, points, np.linspace(0, 20, 81))
-    assert_equal_forms(kinematics._along, points[..., :2, :], np.zeros(3))
+    spin = rng.standard_normal((*batch, 6))
+    assert_equal_forms(trajectories._follow, points, np.linspace(0.25, 20, 80), spin, 0.1)
+    assert_equal_forms(trajectories._follow, points[..., :2, :], np.zeros(3), spin, 0.1)
+
+
+@every_batch
+def test_propagate(batch):
+    rng = np.random.default_rng(4)
+    start = rotations.random(rng, batch), rng.normal(size=(*batch, 3))
+    assert_equal_forms(kinematics._propagate, *start, rng.standard_normal((*batch, 6)), 0.7)
 
 
 @every_batch

@@ -251,6 +251,19 @@ def test_waypoints_go_along_the_line_at_constant_speed_and_rest_at_its_end(seed,
     )
 
 
+def test_simulate_writes_into_given_arrays():
+    rng = np.random.default_rng(7)
+    start = rotations.random(rng, (3,)), rng.standard_normal((3, 3))
+    trajectory = motion.Trajectory(*start, rng.standard_normal((3, 5, 6)))
+    want = motion.simulate(trajectory, 0.1, motion.ProcessNoise())
+    # Epoch by epoch in memory, as the vector environments hold them.
+    arrays = np.empty((6, 3, 3, 3)), np.empty((6, 3, 3))
+    out = motion.Path(*(np.swapaxes(array, 0, 1) for array in arrays))
+    motion.simulate(trajectory, 0.1, motion.ProcessNoise(), out=out)
+    for got, field in zip(out, want, strict=True):
+        np.testing.assert_array_equal(got, field)
+
+
 def test_waypoints_pass_through_the_points():
     path = motion.simulate(motion.waypoints(np.eye(3), POINTS, 2.0, 0.5, 12), 0.5, STILL)
     np.testing.assert_allclose(path.translation[[0, 4, 7, 9]], POINTS[[0, 1, 2, 4]], atol=1e-14)

@@ -177,20 +177,21 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
             raise gym.error.ResetNeeded("call reset() before step()")
         checked = check_actions("actions", actions, self.single_action_space, self.num_envs)
         ended = self._done.copy()
-        if ended.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+        some_ended = ended.any()
+        if some_ended and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
                 "some episodes are over: call reset(), with options={'reset_mask': mask} to "
                 "reset only these"
             )
         moving = ~ended
-        self._epochs[moving] += 1
+        self._epochs += moving
         reward, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
         if moving.any():
             advanced, over = self._advance(checked, moving)
             reward, terminated = np.where(moving, advanced, 0.0), over & moving
         truncated = moving & ~terminated & (self._epochs >= self.steps_limit)
         self._done = terminated | truncated
-        start = self._begin(ended) if ended.any() else {}
+        start = self._begin(ended) if some_ended else {}
         self._shoot()
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._done.any():
             info = {**self._masked_info(), **start}
@@ -232,13 +233,11 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
     def _masked_info(self, where: BoolArray | None = None) -> dict[str, Any]:
         """Return infos with Gymnasium's masks ``_key``; values outside of `where` are zero."""
         info: dict[str, Any] = {}
+        told = np.ones(self.num_envs, dtype=np.bool_) if where is None else where
         for name, value in self._inform().items():
             if where is not None:
                 value[~where] = 0
-            info[name] = value
-            info[f"_{name}"] = (
-                np.ones(self.num_envs, dtype=np.bool_) if where is None else where.copy()
-            )
+            info[name], info[f"_{name}"] = value, told.copy()
         return info
 
 

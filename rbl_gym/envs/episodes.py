@@ -14,8 +14,8 @@ from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes
 
-# Number of worlds drawn and built together, so that intermediate arrays fit the cache.
-_BLOCK = 256
+# Number of worlds drawn and built together, so that their random numbers do not fill the memory.
+_BLOCK = 1024
 
 
 class EpisodeStore:
@@ -46,11 +46,11 @@ class EpisodeStore:
         starts: list[Any] = []
         for first in range(0, len(worlds), _BLOCK):
             block = worlds[first : first + _BLOCK]
-            count = len(block)
-            simulation.draw_each(self._draws, range(count), generators[first : first + count])
-            draws = simulation.Draws(*(field[:count] for field in self._draws))
-            episode = simulation.build_episode(self._scene, draws)
-            self._write(rows_of(block), simulation.whole(episode))
+            draws = simulation.Draws(*(field[: len(block)] for field in self._draws))
+            simulation.draw_each(draws, generators[first : first + len(block)])
+            rows = rows_of(block)
+            episode = simulation.build_episode(self._scene, draws, self._motion_of(rows))
+            self._write(rows, simulation.whole(episode))
             starts.append(episode[len(simulation.Epoch._fields) :])
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
@@ -59,7 +59,14 @@ class EpisodeStore:
             for name, parts in zip(names, zip(*starts, strict=True), strict=True)
         }
 
+    def _motion_of(self, rows: slice | np.ndarray) -> simulation.Motion | None:
+        """Return the motion (b, T + 1, ...) of b worlds; of a slice, views of the arrays."""
+        if not self._timed:
+            return None
+        return simulation.Motion(*[np.swapaxes(field[:, rows], 0, 1) for field in self._timed[:3]])  # pyright: ignore
+
     def _write(self, rows: slice | np.ndarray, fields: simulation.Epoch) -> None:
+        """Store the epochs of some worlds; NumPy skips the assignment of a view to itself."""
         if not self._timed:
             self._timed = [
                 None
@@ -74,13 +81,15 @@ class EpisodeStore:
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """Return the epochs (B,) of all worlds; the random numbers must not be written to."""
         where = self._where(epochs)
-        random = (None if field is None else field[where] for field in self._timed[3:])
-        return simulation.Epoch(*self.motion_at(epochs), *random)  # pyright: ignore[reportArgumentType]
+        random = [None if field is None else field[where] for field in self._timed[3:]]
+        return simulation.Epoch(*self._motion(where), *random)  # pyright: ignore[reportArgumentType]
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
         """Return copies of the motion of all worlds at their epochs (B,)."""
-        where = self._where(epochs)
-        return simulation.Motion(*(np.array(field[where]) for field in self._timed[:3]))  # pyright: ignore[reportOptionalSubscript]
+        return self._motion(self._where(epochs))
+
+    def _motion(self, where: Any) -> simulation.Motion:
+        return simulation.Motion(*[np.array(field[where]) for field in self._timed[:3]])  # pyright: ignore[reportOptionalSubscript]
 
     def _where(self, epochs: np.ndarray) -> Any:
         if self._num_envs == 1 or (epochs == epochs[0]).all():

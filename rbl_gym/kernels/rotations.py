@@ -14,14 +14,28 @@ from rbl_gym.kernels.jit import helper, inlined
 _SMALL = 0.25
 
 
-@helper
+# Taylor coefficients of sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 by -x^2.
+_A = tuple(1 / math.factorial(2 * k + 1) for k in range(7))
+_B = tuple(1 / math.factorial(2 * k + 2) for k in range(7))
+_C = tuple(1 / math.factorial(2 * k + 3) for k in range(7))
+
+
+@inlined
 def coefficients(s: float) -> tuple[float, float, float]:
     """Return sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of s = x^2."""
     if s < _SMALL:
-        a = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156)))))
-        b = 1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90 * (1 - s / 132 * (1 - s / 182)))))
-        c = 1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156 * (1 - s / 210)))))
-        return a, 0.5 * b, c / 6
+        return _polynomial(-s, _A), _polynomial(-s, _B), _polynomial(-s, _C)
+    return _closed_forms(s)
+
+
+@inlined
+def _polynomial(s: float, c: Any) -> float:
+    return c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * (c[4] + s * (c[5] + s * c[6])))))
+
+
+@helper
+def _closed_forms(s: float) -> tuple[float, float, float]:
+    """Compute `coefficients` of angles that are not small."""
     x = math.sqrt(s)
     sine, half = math.sin(x), math.sin(0.5 * x)
     return sine / x, 2 * half * half / s, (x - sine) / (s * x)
@@ -69,7 +83,8 @@ def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
     s = x * x + y * y + z * z
     if s < _SMALL:
         c = 1 + s * (691 / 27300) * (1 + s * (35 / 1382) * (1 + s * (3617 / 142800)))
-        c = (1 + s / 60 * (1 + s / 42 * (1 + s / 40 * (1 + s * (5 / 198) * c)))) / 12
+        c = 1 + s * (1 / 42) * (1 + s * (1 / 40) * (1 + s * (5 / 198) * c))
+        c = (1 + s * (1 / 60) * c) * (1 / 12)
     else:
         half = 0.5 * math.sqrt(s)
         c = (1 - half * math.cos(half) / math.sin(half)) / s

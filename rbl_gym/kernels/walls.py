@@ -24,14 +24,14 @@ def _cut(value: float, low: float, high: float) -> float:
 @gufunc("(d),(d),(d)->(d)")
 def project_to_box(point: Any, low: Any, high: Any, legal: Any) -> None:
     """Compute the nearest point of a box."""
-    for i in range(point.shape[0]):
+    for i in range(3):
         legal[i] = _cut(point[i], low[i], high[i])
 
 
 @gufunc("(d),(d),(d)->(d)")
 def place_in_box(action: Any, middle: Any, half: Any, legal: Any) -> None:
     """Compute the point of an action, [-1, 1]^3 being the box."""
-    for i in range(action.shape[0]):
+    for i in range(3):
         legal[i] = middle[i] + _cut(action[i], -1.0, 1.0) * half[i]
 
 

@@ -180,11 +180,14 @@ def measure(
 
 def lose_links(
     ranges: FloatArray,
-    true_distances: FloatArray,
+    true_distances: FloatArray | None,
     link_model: LinkModel | None = None,
     uniforms: FloatArray | None = None,
 ) -> Measurement:
-    """Apply a link model to noisy ranges of all links; arguments as in `measure`."""
+    """Apply a link model to noisy ranges of all links; arguments as in `measure`.
+
+    Only a model with `reach_m` needs the distances.
+    """
     links = np.ones(ranges.shape, dtype=np.bool_)
     nlos = np.zeros(ranges.shape, dtype=np.bool_)
     if link_model is None or link_model.never_fails:
@@ -195,7 +198,7 @@ def lose_links(
         links &= uniforms[..., 0, :, :] >= link_model.drop_probability
         nlos = uniforms[..., 1, :, :] < link_model.nlos_probability
         ranges = ranges + np.where(nlos, link_model.nlos_bias_m, 0.0)
-    if link_model.reach_m is not None:
+    if link_model.reach_m is not None and true_distances is not None:
         links &= true_distances <= link_model.reach_m
     return Measurement(np.where(links, ranges, 0.0), links, nlos & links)
 
@@ -220,16 +223,13 @@ def sample(
     normals: FloatArray,
     noise: NoiseLaw,
     longest: FloatArray | float,
-) -> tuple[FloatArray, FloatArray]:
-    """Return noisy ranges (..., M, N) of all links at given poses, and the true distances.
-
-    Ranges are clipped to `longest`.
-    """
+) -> FloatArray:
+    """Return noisy ranges (..., M, N) of all links at given poses, clipped to `longest`."""
     numbers = numbers_of(noise, tags.shape[-2])
     if numbers is not None:
         return _sample(rotation, translation, tags, anchors, normals, numbers, longest)
-    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
-    return np.minimum(noise.sample(true, normals), np.asarray(longest)[..., None, None]), true
+    ranges = noise.sample(true_distances(rotation, translation, tags, anchors), normals)
+    return np.minimum(ranges, np.asarray(longest)[..., None, None])
 
 
 @compiled("epoch:measure")
@@ -241,11 +241,19 @@ def _sample(
     normals: FloatArray,
     law: FloatArray,
     longest: FloatArray | float,
-) -> tuple[FloatArray, FloatArray]:
+) -> FloatArray:
     """Compute `sample` for a law given by its numbers."""
-    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
+    true = true_distances.textbook(rotation, translation, tags, anchors)
     ranges = law_of(law).sample(true, normals)
-    return np.minimum(ranges, np.asarray(longest)[..., None, None]), true
+    return np.minimum(ranges, np.asarray(longest)[..., None, None])
+
+
+@compiled("epoch:distances")
+def true_distances(
+    rotation: FloatArray, translation: FloatArray, tags: FloatArray, anchors: FloatArray
+) -> FloatArray:
+    """Return the distances (..., M, N) of anchors and the tags of bodies at given poses."""
+    return kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
 
 
 @checked(anchors=("M", 3), tags=("N", 3), rotation=(3, 3), translation=(3,))
@@ -278,7 +286,7 @@ def simulate(
     check_generator("rng", rng)
     if not isinstance(link_model, LinkModel | None):
         raise ValueError(f"link_model must be a LinkModel or None, got {link_model!r:.80}")
-    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
+    true = true_distances(rotation, translation, tags, anchors)
     normals = rng.standard_normal(true.shape)
     uniforms = None
     if link_model is not None and link_model.is_random:

@@ -4,16 +4,18 @@ from rbl_gym.motion.kinematics import (
     Path,
     ProcessNoise,
     Trajectory,
+    propagate,
+    simulate,
+    twists_between,
+)
+from rbl_gym.motion.trajectories import (
     constant_twist,
     held_twists,
     interpolate,
     lawn_mower_points,
     orbit,
-    propagate,
     random_twist,
     recorded,
-    simulate,
-    twists_between,
     waypoints,
 )
 

@@ -17,7 +17,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
-from rbl_gym.motion.kinematics import between_waypoints
+from rbl_gym.motion.trajectories import between_waypoints
 from rbl_gym.worlds import inertial_motion
 from rbl_gym.worlds.scene import Scene
 
@@ -124,11 +124,11 @@ def empty_draws(scene: Scene, count: int) -> Draws:
     )
 
 
-def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.Generator]) -> None:
-    """Apply `draw` to some rows, each with its own generator, for vector environments."""
-    for row, generator in zip(rows, generators, strict=True):
-        generator.standard_normal(out=draws.normals[row])
-        generator.random(out=draws.uniforms[row])
+def draw_each(draws: Draws, generators: Iterable[np.random.Generator]) -> None:
+    """Apply `draw` to every row with a generator of its own, for vector environments."""
+    for normals, uniforms, generator in zip(*draws, generators, strict=True):
+        generator.standard_normal(out=normals)
+        generator.random(out=uniforms)
 
 
 def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
@@ -181,8 +181,11 @@ def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
     return 3 * scene.n_waypoints, int(scene.trajectory == "orbit"), anchors, links
 
 
-def build_episode(scene: Scene, draws: Draws) -> Episode:
-    """Return the episodes of these random numbers, batched over their leading axes."""
+def build_episode(scene: Scene, draws: Draws, out: Motion | None = None) -> Episode:
+    """Return the episodes of these random numbers, batched over their leading axes.
+
+    `out` are arrays for the motion (..., T + 1, ...), in any memory order; None: new ones.
+    """
     batch = draws.normals.shape[:-1]
     start, process, ranges, held, felt, common, surveyed = _split(
         draws.normals, _normal_sizes(scene)
@@ -191,17 +194,21 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = scene.steps_of_motion
     process = process.reshape((*batch, steps, 6))
-    twists = np.zeros((*batch, scene.steps + 1, 6))
+    if out is None:
+        out = Motion(*(np.empty((*batch, scene.steps + 1, *size)) for size in ((3, 3), (3,), (6,))))
     inertial = (None, None, None)
     if scene.inertial is not None:
         track = inertial_motion.fly(scene, trajectory, process, felt)
-        path = motion.Path(track.rotation, track.translation)
-        twists[..., 1:, :] = track.twists
+        path, twists = motion.Path(track.rotation, track.translation), track.twists
         inertial = track.velocity, track.readings, track.bias
     else:
-        path = motion.simulate(trajectory, scene.dt, scene.process, process)
-        twists[..., scene.steps + 1 - steps :, :] = trajectory.twists
-    offset = start[..., 7:]
+        # With a step before epoch 0 the path is longer than its part in `out`.
+        held = motion.Path(*out[:2]) if steps == scene.steps else None
+        path = motion.simulate(trajectory, scene.dt, scene.process, process, held)
+        twists = trajectory.twists
+    first_known = scene.steps + 1 - twists.shape[-2]
+    out.twist[..., :first_known, :] = 0.0
+    out.twist[..., first_known:, :] = twists
     covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
     if scene.prior == "start":
@@ -209,18 +216,18 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         first = trajectory.twists[..., 0, :]
         prior = motion.propagate(rotation, translation, first, scene.dt)
         covariance = bounds.predict_covariance(covariance, first, scene.dt, scene.process)
-        path = motion.Path(path.rotation[..., 1:, :, :], path.translation[..., 1:, :])
     else:
-        prior = (
-            rotations.exp(scene.initial_rotation_rad * offset[..., :3]) @ rotation,
-            translation + scene.initial_translation_m * offset[..., 3:],
-        )
+        offset = np.sqrt(covariance.diagonal()) * start[..., 7:]
+        prior = motion.propagate(rotation, translation, offset, 1.0)
+    before = path.translation.shape[-2] - scene.steps - 1
+    out.rotation[...] = path.rotation[..., before:, :, :]
+    out.translation[...] = path.translation[..., before:, :]
     if scene.anchors is None:
         spots = spots.reshape((*batch, scene.n_anchors, 3))
         if scene.anchor_start_m is None:
             anchors = scene.anchor_region.draw(spots)
         else:
-            around = path.translation[..., :1, :] + scene.anchor_start_m * (2 * spots - 1)
+            around = out.translation[..., :1, :] + scene.anchor_start_m * (2 * spots - 1)
             anchors = scene.anchor_region.project(around)
         if scene.fixed:
             anchors[..., : len(scene.fixed), :] = scene.fixed
@@ -237,7 +244,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         survey = scene.survey_std_m * np.clip(surveyed, -6.0, 6.0)
         survey = survey.reshape((*batch, 1, scene.n_anchors, 3))
         survey = np.broadcast_to(survey, (*batch, scene.steps + 1, scene.n_anchors, 3))
-    return Episode(*path, twists, *random, *inertial, offsets, survey, *prior, covariance, anchors)
+    return Episode(*out, *random, *inertial, offsets, survey, *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -306,14 +313,15 @@ def measure_epoch(
     if quality is not None:
         normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
     longest = scene.range_limit_m
-    ranges, distances = ranging.sample(
-        at.rotation, at.translation, scene.body, anchors, normals, scene.noise, longest
-    )
+    body = at.rotation, at.translation, scene.body
+    ranges = ranging.sample(*body, anchors, normals, scene.noise, longest)
     # A range of zero has no variance under a proportional law, so it is not a measurement.
     if scene.links.never_fails:
         links, nlos = ranges > 0, np.zeros(ranges.shape, dtype=np.bool_)
     else:
-        taken = ranging.lose_links(ranges, distances, scene.links, at.uniforms)
+        reaches = scene.links.reach_m is not None
+        true = ranging.true_distances(*body, anchors) if reaches else None
+        taken = ranging.lose_links(ranges, true, scene.links, at.uniforms)
         ranges = np.minimum(taken.ranges, np.asarray(longest)[..., None, None])
         links, nlos = taken.links & (ranges > 0), taken.nlos
     if quality is not None and not np.all(quality):
