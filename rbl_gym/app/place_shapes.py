@@ -261,18 +261,10 @@ def spread_labels(
     marker: float,
     taken: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> FloatArray:
-    """Return centres (K, 2) of labels next to points (K, 2), without overlaps.
+    """Return centres (K, 2) of labels next to points (K, 2), without overlaps; all in pixels.
 
-    Parameters
-    ----------
-    points, sizes
-        Positions of the markers, widths and heights of the labels (K, 2); pixels.
-    edges
-        Lower and upper corner (2, 2) of the view.
-    marker
-        Half size of a marker.
-    taken
-        Centres and half sizes (2,) of existing objects.
+    `sizes` are widths and heights of the labels, `edges` the corners (2, 2) of the view, `marker`
+    half the size of a marker, `taken` centres and half sizes of existing objects.
     """
     placed: list[FloatArray] = []
     angles = np.deg2rad([25, 155, -25, -155, 90, -90, 0, 180, 60, 120, -60, -120])

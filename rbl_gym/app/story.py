@@ -23,23 +23,11 @@ class Beliefs(NamedTuple):
 
 
 class Story(NamedTuple):
-    """A track of K epochs.
+    """A track of K epochs: times (K,), anchors (M, 3), tags (N, 3), beliefs by filter name.
 
-    Attributes
-    ----------
-    times
-        (K,), seconds.
-    anchors, names
-        Anchors (M, 3) and their names.
-    tags
-        Tags (N, 3) in the body frame.
-    truth
-        Rotation (K, 3, 3), or None for positions only, translation (K, 3), and whether they are
-        known (K,). None: no truth.
-    beliefs
-        Beliefs by filter name.
-    axes
-        ``"xyz"``, or ``"xy"``: only yaw and the horizontal position are evaluated.
+    `truth` is rotation (K, 3, 3), or None for positions only, translation (K, 3), and whether they
+    are known (K,); None: no truth. `axes` is ``"xyz"``, or ``"xy"``: only yaw and the horizontal
+    position are evaluated.
     """
 
     times: FloatArray

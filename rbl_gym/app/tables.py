@@ -45,16 +45,9 @@ def new_table(
     notes: Iterable[str] = (),
     whole: int = 0,
 ) -> Table:
-    """Return a table for `new_console`.
+    """Return a table for `new_console`: texts on the left, then figures, aligned right, then notes.
 
-    Parameters
-    ----------
-    title
-        Title above the table; None: no title.
-    texts, figures, notes
-        Headings of the columns: texts on the left, then figures, aligned right, then further texts.
-    whole
-        Number of columns, from the left, whose cells are not wrapped.
+    The cells of the first `whole` columns are not wrapped.
     """
     columns = [Column(heading, False, k < whole, True) for k, heading in enumerate(texts)]
     columns += [Column(heading, True, True, False) for heading in figures]

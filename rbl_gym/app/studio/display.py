@@ -20,17 +20,8 @@ _MESSAGE_S = 6.0
 class Display:
     """Draws the static parts once, then every `Shown`.
 
-    Parameters
-    ----------
-    server
-        The viser server.
-    start
-        The initial state.
-    actions
-        Callbacks of `Panel`, and ``drag`` and ``drag_body``, which `moving_view.AnchorView` and
-        `BodyView` call.
-    has_report
-        Whether the panel has a button for the report.
+    `actions` are those of `Panel`, and ``drag`` and ``drag_body``, which `moving_view.AnchorView`
+    and `BodyView` call.
     """
 
     def __init__(

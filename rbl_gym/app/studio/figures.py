@@ -23,14 +23,8 @@ _FEW = 1200
 class ZoneFigures(NamedTuple):
     """Expected errors of a layout in a zone: RMS values, and the share that meets the requirement.
 
-    Attributes
-    ----------
-    name, verdict
-        Name of the zone; ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``.
-    share, required
-        Shares of the positions; NaN if there is no requirement.
-    position_m, height_m, heading_deg
-        Standard deviations of the horizontal position, the height and the heading.
+    `verdict` is ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``; then the shares
+    are NaN.
     """
 
     name: str
@@ -59,15 +53,7 @@ class Figures(NamedTuple):
 
 
 def figures(state: State, few: bool = False) -> Figures:
-    """Return the figures of a state, with fewer positions while an anchor is dragged.
-
-    Parameters
-    ----------
-    state
-        The problem and the layout.
-    few
-        Use fewer positions of each zone; the score is the same.
-    """
+    """Return the figures of a state, with fewer positions while an anchor is dragged (`few`)."""
     world, anchors = state.world, state.anchors
     zones = world.problem.zones
     most = max(24, _FEW // (len(anchors) * len(zones))) if few else None
@@ -118,13 +104,7 @@ def usual_scores(world: World, n_anchors: int) -> dict[str, float]:
 
 
 class Others:
-    """Layouts for comparison: the usual ones and designed ones.
-
-    Attributes
-    ----------
-    designed
-        Layouts by knobs and number of anchors.
-    """
+    """Layouts for comparison: the usual ones, and designed ones by knobs and number of anchors."""
 
     def __init__(self) -> None:
         self.designed: dict[tuple[Knobs, int], FloatArray] = {}

@@ -56,19 +56,8 @@ def default_name(problem: Problem) -> str:
 def save(state: State, tables: Mapping[str, Any], folder: Path, name: str) -> list[Path]:
     """Write NAME.toml, the scene with all anchors fixed, and NAME.csv, the mounting list.
 
-    Parameters
-    ----------
-    state
-        The state to save.
-    tables
-        Tables of the file from which the problem was read, or the result of `tables_of`.
-    folder, name
-        The folder, created if needed, and the name of the files.
-
-    Raises
-    ------
-    ValueError
-        If the name is not valid, or a file of that name was not written by the studio.
+    `tables` are those of the file from which the problem was read, or of `tables_of`. Raises
+    ValueError if the name is not valid, or a file of that name was not written by the studio.
     """
     stem = owned(folder, name)
     scene, layout = stem.with_name(f"{stem.name}.toml"), stem.with_name(f"{stem.name}.csv")
@@ -124,15 +113,7 @@ def _is_ours(scene: Path) -> bool:
 def save_report(
     state: State, tables: Mapping[str, Any], folder: Path, name: str, report: Report
 ) -> list[Path]:
-    """Run `save` and write NAME.pdf, the report. Raises the same errors.
-
-    Parameters
-    ----------
-    state, tables, folder, name
-        Arguments as in `save`.
-    report
-        Writes the report.
-    """
+    """Run `save`, and write NAME.pdf by `report`."""
     scene, layout = save(state, tables, folder, name)
     path = scene.with_suffix(".pdf")
     replace(path, lambda draft: report(state.problem, state.anchors, str(draft)))
@@ -232,10 +213,7 @@ def _with_knobs(tables: dict[str, Any], state: State) -> dict[str, Any]:
 def tables_of(problem: Problem) -> dict[str, Any]:
     """Return the tables of a scene file for a problem of a named scene, without its anchors.
 
-    Raises
-    ------
-    ValueError
-        If the problem has mounts or prisms, which only its own file can describe.
+    Raises ValueError for mounts or prisms, which only its own file can describe.
     """
     mounts, noise = problem.mounts, problem.noise
     kinds = {Walls: "room", Box: "box", Shell: "shell"}

@@ -19,19 +19,7 @@ _APART_S = 1.0
 class Keeper:
     """Writes the layout of a session into a folder.
 
-    Parameters
-    ----------
-    start
-        The initial state.
-    tables
-        Tables of the file from which the problem was read.
-    folder
-        Folder for all files.
-
-    Attributes
-    ----------
-    found
-        Unsaved anchors (M, 3) of the last session, metres, or None.
+    `found` are unsaved anchors (M, 3) of the last session, metres, or None.
     """
 
     def __init__(self, start: State, tables: Mapping[str, Any], folder: Path) -> None:

@@ -59,22 +59,11 @@ QUANTITIES: dict[str, Quantity] = {
 
 
 class SliceMap(NamedTuple):
-    """Values on a plane.
+    """Values (rows, columns) on a plane with two corners (3,), and its colour limits.
 
-    Attributes
-    ----------
-    values
-        (rows, columns), in the unit of the quantity. NaN outside the zones and inside obstacles.
-        For ``"requirement"`` the largest ratio of an error to its limit; at most 1 meets the
-        requirement.
-    low, high
-        Corners (3,) of the plane, metres.
-    up
-        Axis of the rows; the axis of the columns is x.
-    quantity
-        The quantity.
-    limits
-        Values at the two ends of the colour scale.
+    Values are in the unit of the quantity, NaN outside the zones and inside obstacles. For
+    ``"requirement"`` they are the largest ratio of an error to its limit; at most 1 meets the
+    requirement. `up` is the axis of the rows; the axis of the columns is x.
     """
 
     values: FloatArray
@@ -118,16 +107,9 @@ def shape_of(extent: FloatArray, cells: int) -> tuple[int, int]:
 
 
 def slice_map(state: State, cells: int = COARSE, before: SliceMap | None = None) -> SliceMap:
-    """Return the map of the slice of a state.
+    """Return the map of the slice of a state, with about `cells` cells; fewer for many anchors.
 
-    Parameters
-    ----------
-    state
-        The problem, the layout and the slice.
-    cells
-        Approximate number of cells for few anchors; many anchors reduce it.
-    before
-        Previous map, whose colour limits are kept if they still fit; None uses the map's own.
+    The colour limits of the map `before` are kept if they still fit.
     """
     problem, at = state.world.problem, state.slice
     low, high = plane(state)

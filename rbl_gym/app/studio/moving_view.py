@@ -94,12 +94,7 @@ class ZoneView:
 class BodyView:
     """The body with its tags, and a line to every anchor: green if in sight, else red.
 
-    Parameters
-    ----------
-    scene, least_m
-        The viser scene, and the minimum displayed size in metres, so that the body is visible.
-    dragged
-        Called with 0, the phase, the camera's position (3,) and a point (3,) under the pointer.
+    It is drawn at least `least_m` large. `dragged` is called as by `AnchorView`, with index 0.
     """
 
     def __init__(self, scene: Any, least_m: float, dragged: Dragged) -> None:
@@ -145,15 +140,9 @@ class BodyView:
 class AnchorView:
     """The anchors as balls that a user can drag.
 
-    Parameters
-    ----------
-    scene, extent
-        The viser scene, and the largest extent of the room in metres.
-    dragged
-        Called with the anchor's index, the phase (``"start"``, ``"update"``, ``"end"``),
-        the camera's position (3,) and a point (3,) under the pointer.
-    clicked
-        Called with the anchor's index.
+    `dragged` is called with the anchor's index, the phase (``"start"``, ``"update"``, ``"end"``),
+    the camera's position (3,) and a point (3,) under the pointer; `clicked` with the index.
+    `extent` is the largest extent of the room, metres.
     """
 
     def __init__(

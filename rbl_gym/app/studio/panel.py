@@ -28,18 +28,8 @@ _CSS = (
 class Shown(NamedTuple):
     """The content of the panel.
 
-    Attributes
-    ----------
-    state, figures, map
-        The layout, its figures, and the map.
-    others
-        b of other layouts by name, metres; None: not known yet.
-    selected
-        Index of an anchor, or None.
-    progress
-        Progress of long work, from 0 to 1, or None.
-    status
-        The message, one line.
+    `others` are b of other layouts by name, metres; None: not known yet. `progress` is from 0 to 1,
+    or None. `status` is one line.
     """
 
     state: State
@@ -52,23 +42,12 @@ class Shown(NamedTuple):
 
 
 class Panel:
-    """Controls of the panel.
+    """Controls of the panel, in the GUI of a viser server.
 
-    Parameters
-    ----------
-    gui
-        The GUI of a viser server, in the container of the panel.
-    state
-        The initial state.
-    name
-        Default name of files.
-    actions
-        Callbacks by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
-        ``optimise``, ``stop``, ``design``, ``reset_knobs``, ``restore`` without arguments;
-        ``select`` with an index or None; ``cut`` and ``knobs`` with keywords; ``save`` and
-        ``report`` with a name, ``load`` with a file's name and its bytes.
-    has_report
-        Whether the panel has a button for the report.
+    `actions` are callbacks by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
+    ``optimise``, ``stop``, ``design``, ``reset_knobs``, ``restore`` without arguments; ``select``
+    with an index or None; ``cut`` and ``knobs`` with keywords; ``save`` and ``report`` with a name,
+    ``load`` with a file's name and its bytes.
     """
 
     def __init__(

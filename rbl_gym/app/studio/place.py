@@ -31,20 +31,8 @@ from rbl_gym.studies.placing import design
 class PlacePage:
     """Shows a state in a viser server, and changes it as the user asks.
 
-    Parameters
-    ----------
-    server
-        The viser server.
-    start
-        The initial state.
-    tables
-        Tables of the file from which the problem was read.
-    folder
-        Folder for all files.
-    report
-        Writes a report of a problem and a layout to a path; None: the page has no report button.
-    seed
-        Seed of all searches.
+    `tables` are those of the file from which the problem was read. `report` writes a report of a
+    problem and a layout to a path; None: the page has no report button.
     """
 
     def __init__(
@@ -105,14 +93,8 @@ class PlacePage:
     def drag(self, index: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
         """Move an anchor to the mount under the pointer.
 
-        Parameters
-        ----------
-        index
-            Index of the anchor.
-        phase
-            ``"start"``, ``"update"``, ``"end"``.
-        camera, point
-            Two points (3,) of the line of sight, metres.
+        `phase` is ``"start"``, ``"update"`` or ``"end"``; `camera` and `point` are two points (3,)
+        of the line of sight.
         """
         asked = time.perf_counter()
         key = None if phase != "update" else ("drag", index)

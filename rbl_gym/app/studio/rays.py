@@ -16,16 +16,8 @@ def under_pointer(
 ) -> FloatArray:
     """Return the mount (3,) that a line of sight meets; of several, the one nearest to `near`.
 
-    If the line meets no mount, return the mount with the smallest angle from the line.
-
-    Parameters
-    ----------
-    world
-        The world with the mounts.
-    camera, point
-        Two points (3,) of the line of sight, metres.
-    near
-        Present position (3,) of the anchor, metres.
+    If the line meets no mount, return the mount with the smallest angle from the line. `camera` and
+    `point` are two points (3,) of the line.
     """
     mounts = world.problem.mounts
     direction = point - camera

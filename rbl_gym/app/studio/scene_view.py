@@ -76,12 +76,7 @@ def look(client: Any, problem: Problem, panels: int = PANEL) -> None:
 def view_of(problem: Problem, aspect: float) -> tuple[FloatArray, FloatArray]:
     """Return target and position (3,) of a camera that shows the complete problem.
 
-    Parameters
-    ----------
-    problem
-        The problem to show.
-    aspect
-        Width of the window over its height.
+    `aspect` is the width of the window over its height.
     """
     low, high = corners(problem)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)

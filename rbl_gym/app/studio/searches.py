@@ -19,15 +19,7 @@ _ROUNDS, _STEPS, _LEAST_GAIN = 12, 8, 2e-3
 
 
 def add_best(state: State, seed: int = 0) -> State:
-    """Add an anchor at the best position. Arguments as in `add`, and the same errors.
-
-    Parameters
-    ----------
-    state
-        The current state.
-    seed
-        Seed of the candidates.
-    """
+    """Add an anchor at the best position. The same errors as in `add`."""
     if len(state.anchors) >= MAX_ANCHORS:
         raise ValueError(f"a layout has at most {MAX_ANCHORS} anchors")
     found = choosing.next_anchor(state.problem, state.anchors, seed)
@@ -40,18 +32,8 @@ def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:
     """Improve the layout step by step; the fixed anchors do not move.
 
     Every round takes some gradient steps, and draws fresh candidates if there are obstacles. All
-    rounds count as one change: undo restores the layout from before the first.
-
-    Parameters
-    ----------
-    state
-        The initial state.
-    seed
-        Seed of the fresh candidates.
-
-    Yields
-    ------
-    Progress from 0 to 1, and a state whose score is at most the previous one.
+    rounds count as one change: undo restores the layout from before the first. Yields progress from
+    0 to 1, and a state whose score is at most the previous one.
     """
     world, (start, fixed) = state.world, state.layout
     free = np.flatnonzero(~fixed)

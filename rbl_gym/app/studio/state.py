@@ -75,20 +75,9 @@ _FIRST_SLICE = Slice()
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The state of the studio.
+    """The state of the studio; `body` is the position (3,) of the body on the slice, metres.
 
-    Parameters
-    ----------
-    world
-        The problem and its knobs.
-    layout
-        The anchors.
-    body
-        Position (3,) of the body on the slice, metres.
-    slice
-        Quantity and plane of the map.
-    past, future
-        Layouts for undo and redo, the next one last.
+    `past` and `future` are layouts for undo and redo, the next one last.
     """
 
     world: World

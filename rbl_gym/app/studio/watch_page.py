@@ -26,15 +26,7 @@ _BEHIND = np.array([-2.5, -7.0, 5.0])
 
 
 class WatchPage:
-    """Shows the frames of a program in a viser server.
-
-    Parameters
-    ----------
-    server
-        The viser server.
-    program
-        The program to show.
-    """
+    """Shows the frames of a program in a viser server."""
 
     def __init__(self, server: Any, program: Program) -> None:
         self._server, self.program = server, program

@@ -62,19 +62,12 @@ def chosen(labels: Sequence[str], filters: Sequence[str]) -> tuple[str, ...]:
 
 
 class WatchPanel:
-    """Controls of the panel.
+    """Controls of the panel, in the GUI of a viser server.
 
-    Parameters
-    ----------
-    gui
-        The GUI of a viser server, in the container of the panel.
-    program
-        The program to show.
-    actions
-        Callbacks by name: ``play``, ``step``, ``restart`` without arguments; ``speed`` with a
-        factor; ``seek`` with the number of a frame; ``begin`` with labels of filters and a seed;
-        ``disturb`` with `Disturbances`; ``links`` with the index of a filter; ``follow`` with True
-        if the camera follows the body.
+    `actions` are callbacks by name: ``play``, ``step``, ``restart`` without arguments; ``speed``
+    with a factor; ``seek`` with the number of a frame; ``begin`` with labels of filters and a seed;
+    ``disturb`` with `Disturbances`; ``links`` with the index of a filter; ``follow`` with True if
+    the camera follows the body.
     """
 
     def __init__(

@@ -52,16 +52,10 @@ def ellipsoid(covariance: FloatArray) -> Ellipsoid | None:
 def link_lines(
     frame: Frame, which: int, tags: FloatArray, enlarged: float
 ) -> dict[str, FloatArray]:
-    """Return links (S, 2, 3) by kind, from the anchors to the tags.
+    """Return links (S, 2, 3) by kind, from the anchors to the tags of the enlarged body.
 
-    Parameters
-    ----------
-    frame
-        The frame to draw. Without truth the links end at the first filter's estimate.
-    which
-        Index of the filter whose rejections are shown.
-    tags, enlarged
-        The body (N, 3), and its enlargement factor.
+    Rejections are those of the filter `which`. Without truth the links end at the first filter's
+    estimate.
     """
     kinds = link_kinds(frame.links, frame.tracks[which].rejected if frame.tracks else None)
     pose: Any = frame.truth
@@ -86,17 +80,7 @@ def letterbox(picture: np.ndarray, aspect: float) -> np.ndarray:
 
 
 class WatchView:
-    """Draws frames.
-
-    Parameters
-    ----------
-    scene
-        The scene of a viser server.
-    extent
-        Largest side of the scene, metres.
-    tags
-        (N, 3) on the body, metres.
-    """
+    """Draws frames in the scene of a viser server; `extent` is its largest side, metres."""
 
     def __init__(self, scene: Any, extent: float, tags: FloatArray) -> None:
         self._scene, self._extent, self._tags = scene, extent, tags

@@ -34,12 +34,8 @@ class Worker:
     """Runs tasks one after the other, and steps of long work in between.
 
     The callbacks of the page run in their own threads. They pass all tasks to one worker. The state
-    then has a single writer and needs no lock.
-
-    Parameters
-    ----------
-    failed
-        Called with the exception of a failed task; the worker continues.
+    then has a single writer and needs no lock. `failed` is called with the exception of a failed
+    task; the worker continues.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -55,12 +51,7 @@ class Worker:
     def post(self, task: Callable[[], object], key: object = None) -> None:
         """Queue a task.
 
-        Parameters
-        ----------
-        task
-            The task.
-        key
-            A waiting task with the same key is dropped, so that only the last one runs.
+        A waiting task with the same key is dropped, so that only the last one runs.
         """
         with self._changed:
             self._tasks.pop(key, None)

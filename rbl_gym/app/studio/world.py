@@ -68,15 +68,7 @@ def loss_db(share: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A problem as it was opened, and the knobs.
-
-    Parameters
-    ----------
-    base
-        The problem as it was opened.
-    knobs
-        The changes to it.
-    """
+    """A problem as it was opened, and the knobs that change it."""
 
     base: Problem
     knobs: Knobs
