@@ -24,18 +24,11 @@ _UPPER = np.triu_indices(6, 1)
 class CraftTokens(NamedTuple):
     """Observations of M craft: arrays with leading axes (B, M).
 
-    Attributes
-    ----------
-    own
-        (B, M, `OWN`): the vehicle and its belief in the craft's frame.
-    pairs
-        (B, M, M, `PAIR`): entry i, j is craft j in the frame of craft i.
-    others
-        (B, M, M): 1 if j is another craft than i and both exist.
-    frames
-        (B, M, 2, 2): from horizontal world axes to the craft's.
-    orbit
-        (B, M, 2): horizontal velocity of the orbit in the craft's frame, in units of the limit.
+    `own` (B, M, `OWN`) is the vehicle and its belief in the craft's frame; `pairs` (B, M, M,
+    `PAIR`): entry i, j is craft j in the frame of craft i; `others` (B, M, M): 1 if j is another
+    craft than i and both exist; `frames` (B, M, 2, 2): from horizontal world axes to the craft's;
+    `orbit` (B, M, 2): the horizontal velocity of the orbit in the craft's frame, in units of the
+    limit.
     """
 
     own: FloatArray

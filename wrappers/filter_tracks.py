@@ -172,18 +172,9 @@ def follow(
 ) -> Iterator[PoseBelief]:
     """Return the beliefs (..., 8) of a filter at every epoch of the tracks.
 
-    Parameters
-    ----------
-    task, context, anchors
-        The family of problems, problems (...,) of it, and their layouts (..., M, 3).
-    filter
-        The filter, made with the scene's tags, noise and process.
-    course
-        The tracks, from `tracks`.
-    wider
-        Factor on the scene's initial standard deviations.
-    measures
-        Whether there are ranges.
+    The layouts (..., M, 3) are of problems (...). The `filter` has the scene's tags, noise and
+    process. `course` is from `tracks`; `wider` a factor on the scene's initial standard deviations;
+    `measures` whether there are ranges.
     """
     scene, shape = task.scene, course.normals.shape[:-3]
     anchors = np.broadcast_to(anchors[..., None, :, :], (*shape, *anchors.shape[-2:]))

@@ -205,14 +205,8 @@ def viewer_of(observation: ViewLike) -> Viewer:
 class Viewer:
     """Converts the epochs of an environment to observations; call `space_of` first.
 
-    Attributes
-    ----------
-    kind
-        A name of `OBSERVATIONS`, or ``"own"``.
-    function
-        The custom view.
-    hides_obstacles
-        Whether to leave obstacle tokens out.
+    `kind` is a name of `OBSERVATIONS`, or ``"own"`` for the custom view `function`;
+    `hides_obstacles` leaves obstacle tokens out.
     """
 
     kind: str

@@ -62,13 +62,7 @@ class HeadingState(NamedTuple):
 class HeadingBank:
     """Bank of filters that start at several headings.
 
-    Parameters
-    ----------
-    filter
-        The filter of each hypothesis.
-    headings
-        Number of headings. They cover the circle, or five standard deviations of the prior's yaw
-        if that is less.
+    The `headings` cover the circle, or five standard deviations of the prior's yaw if that is less.
     """
 
     filter: AugmentedEkf
@@ -119,12 +113,7 @@ class HeadingBank:
     def predict(self, state: HeadingState, twist: ArrayLike, dt: Any) -> HeadingState:
         """Return the state of all hypotheses after `dt` seconds.
 
-        Parameters
-        ----------
-        state, dt
-            The state, and the time step in seconds.
-        twist
-            Input of the filter: a twist (..., 6), or readings (..., S, 6) of a sensor.
+        The input of the filter is a twist (..., 6), or readings (..., S, 6) of a sensor.
         """
         trailing = 1 if self.reads == "twist" else 2
         told = np.asarray(twist, dtype=np.float64)

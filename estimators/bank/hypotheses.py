@@ -25,16 +25,9 @@ EMPTY = PoseState(
 class BankState(NamedTuple):
     """The leading hypothesis and K rivals, with leading batch axes.
 
-    Attributes
-    ----------
-    rotation, translation, covariance
-        (..., 3, 3), (..., 3), (..., 6, 6) of the leader.
-    rival_rotation, rival_translation, rival_covariance
-        (..., K, 3, 3), (..., K, 3), (..., K, 6, 6).
-    log_odds
-        (..., K) of each rival against the leader; minus infinity for an empty slot.
-    nis, links
-        (...): sums over a fading window of squared whitened innovations, and of links.
+    `log_odds` (..., K) are those of each rival against the leader; minus infinity for an empty
+    slot. `nis` and `links` (...) are sums over a fading window, of squared whitened innovations and
+    of links.
     """
 
     rotation: FloatArray

@@ -89,14 +89,8 @@ def _lagged(a: FloatArray) -> FloatArray:
 class Whitener:
     """Scalar Kalman filters of the slow parts of L links, run in successive blocks of epochs.
 
-    Parameters
-    ----------
-    std
-        (L,) standard deviations of the errors, white and slow parts together.
-    drift
-        The slow part.
-    times
-        (K,) of all epochs.
+    `std` (L,) are the standard deviations of the errors, white and slow parts together; `times`
+    (K,) those of all epochs.
     """
 
     def __init__(self, std: FloatArray, drift: Drift, times: FloatArray) -> None:

@@ -73,25 +73,11 @@ def extended(state: AugmentedState, *blocks: FloatArray) -> AugmentedState:
 class BiasProblem:
     """Maximum a posteriori pose of one epoch of ranges with biases; leading batch axes.
 
-    Attributes
-    ----------
-    rotation, translation
-        Pose of the prior.
-    information
-        (..., 6, 6), inverse of the prior covariance of the pose.
-    extra, gain, spread
-        x0 (..., K), G (..., K, 6), C (..., K, K).
-    sums
-        S (..., L, K): derivative of the ranges by the extra states.
-    ranges, variance, links
-        (..., L), metres, m^2, and which of the L = M N links were measured.
-    anchors, tags
-        (..., M, 3), (N, 3).
-    weight
-        (..., L, L), inverse covariance of nu; zero for missing links. Common offsets are projected
-        out.
-    offset
-        Kind of the offsets, as in `measurements.offsets`; None: no offsets.
+    The prior has the pose, the inverse covariance of the pose `information` (..., 6, 6), x0 (...,
+    K), G (..., K, 6), C (..., K, K), and `sums` S (..., L, K), the derivative of the ranges by the
+    extra states. `ranges`, `variance`, `links` (..., L) are of the L = M N links, in metres and
+    m^2. `weight` (..., L, L) is the inverse covariance of nu; it is zero for missing links, and
+    common offsets are projected out. `offset` is their kind, as in `measurements.offsets`, or None.
     """
 
     rotation: FloatArray

@@ -24,16 +24,9 @@ from rbl_gym.measurements import bearing
 class DoaCost:
     """Cost of a pose given one epoch of directions of arrival; arrays with leading batch axes.
 
-    Parameters
-    ----------
-    angles, weights
-        (..., 2, N): radians, inverse variances [1/rad^2]; weight 0 without a measurement.
-    tags
-        (..., N, 3), metres.
-    station
-        (..., 3), the base station, metres.
-    loss
-        Loss of the squared whitened residuals, (..., 5), as in `losses.loss_of`.
+    `angles` and `weights` (..., 2, N) are radians and inverse variances [1/rad^2], 0 without a
+    measurement. Tags (..., N, 3) and the base station (..., 3) are in metres. `loss` (..., 5) is
+    that of the squared whitened residuals, as in `losses.loss_of`.
     """
 
     angles: FloatArray

@@ -55,15 +55,9 @@ def loss_of(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the cost of squared whitened residuals (..., M, N), and their weights in [0, 1].
 
-    Parameters
-    ----------
-    squared
-        ``x^2`` (..., M, N).
-    loss
-        (..., 5), from `huber`, `cut_huber`, `geman_mcclure`, `redescending`, or `SQUARES`.
-        Huber's is ``x^2 / 2`` up to its threshold k, and ``k |x| - k^2 / 2`` beyond.
-    late
-        (..., M, N), which ranges are longer than expected; None: not used by the loss.
+    `loss` (..., 5) is from `huber`, `cut_huber`, `geman_mcclure`, `redescending`, or `SQUARES`.
+    Huber's is ``x^2 / 2`` up to its threshold k, and ``k |x| - k^2 / 2`` beyond. `late` (..., M,
+    N): which ranges are longer than expected; None: not used by the loss.
     """
     threshold, cutoff, scale, power, of_late = (loss[..., i, None, None] for i in range(5))
     held = np.minimum(squared, cutoff**2)

@@ -29,15 +29,8 @@ _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 def kept_wide(prior: Any, posterior: Any, heard: BoolArray | np.bool_, tags: FloatArray) -> Any:
     """Return the posterior with a covariance that keeps unobserved directions as wide as before.
 
-    Parameters
-    ----------
-    prior, posterior
-        Poses before and after the update, NamedTuples with `rotation`, `translation` and
-        `covariance`.
-    heard
-        (..., N), which tags had any link.
-    tags
-        (..., N, 3), metres.
+    `prior` and `posterior` are poses before and after the update, NamedTuples with `rotation`,
+    `translation` and `covariance`. `heard` (..., N): which of the tags (..., N, 3) had any link.
     """
     thin, centre = _line(heard, tags)
     if not thin.any():

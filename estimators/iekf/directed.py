@@ -22,18 +22,9 @@ def directed(
     anchors: FloatArray,
     tags: FloatArray,
 ) -> AugmentedState:
-    """Return the state with the biases (M N) by direction appended.
+    """Return the state, before or after an update, with the biases (M N) by direction appended.
 
-    Parameters
-    ----------
-    state
-        State of the filter, before or after an update.
-    law
-        Law of M anchors and N tags.
-    about
-        Rotation (..., 3, 3) and translation (..., 3) of the linearisation.
-    anchors, tags
-        (..., M, 3) and (N, 3).
+    `about` is the pose of the linearisation. `law` is that of anchors (..., M, 3) and tags (N, 3).
     """
     found = direction_bias(law, *about, anchors, tags)
     links = found.bias.shape[-2] * found.bias.shape[-1]

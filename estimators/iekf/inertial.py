@@ -105,15 +105,8 @@ def fade(
 ) -> tuple[FloatArray, FloatArray]:
     """Return extra states and covariance after `dt` seconds (...), over which biases decorrelate.
 
-    Parameters
-    ----------
-    extra, covariance
-        As in `AugmentedState`.
-    laws
-        (n, 3) of the biases: standard deviation, time (infinite: constant), common standard
-        deviation.
-    dt, n_twist
-        Seconds (...), and the number of extra states that are not biases.
+    `laws` (n, 3) are the biases' standard deviation, time (infinite: constant), and common standard
+    deviation. `n_twist` is the number of extra states that are not biases.
     """
     start = 6 + n_twist
     links = (covariance.shape[-1] - start) // len(laws)

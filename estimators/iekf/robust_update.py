@@ -38,16 +38,8 @@ def robust_solution(
 
     Links whose innovation no consistent prior explains are excluded at the start. If the resulting
     pose disagrees, for links in or out, they are selected again from a solution with Huber's loss,
-    successively at `_CUTOFFS`.
-
-    Parameters
-    ----------
-    problem
-        Its loss is ignored.
-    rotation, translation
-        The starts, (..., 3, 3) and (..., 3).
-    iterations
-        Gauss-Newton iterations of each stage.
+    successively at `_CUTOFFS`. Each stage has so many Gauss-Newton iterations; the problem's own
+    loss is ignored.
     """
     data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
     data = dataclasses.replace(data, loss=huber(HUBER))

@@ -34,12 +34,8 @@ _TURN = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 class Motion(NamedTuple):
     """The motion over a time step: ``Q <- exp(w dt) Q + noise``, ``t <- t + v dt + noise``.
 
-    Attributes
-    ----------
-    twist, dt
-        Known twist (w, v) (..., 6), and seconds.
-    rate
-        Variances (12,) added in 1 s, the same for all entries of Q.
+    The twist (w, v) (..., 6) is known. `rate` are variances (12,) added in 1 s, the same for all
+    entries of Q.
     """
 
     twist: FloatArray
@@ -48,15 +44,10 @@ class Motion(NamedTuple):
 
 
 class LinearEpoch(NamedTuple):
-    """One checked epoch, the input of the linear update.
+    """One checked epoch, the input of the linear update; metres.
 
-    Attributes
-    ----------
-    ranges, anchors, tags
-        (..., M, N), 0 without a link, (..., M, 3) and (N, 3); metres.
-    weights
-        Inverse variances of the squared ranges [1/m^4], 0 without a link: (..., M, 1) if all tags
-        share them, else (..., M, N).
+    `ranges` (..., M, N) are 0 without a link, as are `weights`, the inverse variances of the
+    squared ranges [1/m^4]: (..., M, 1) if all tags share them, else (..., M, N).
     """
 
     ranges: FloatArray

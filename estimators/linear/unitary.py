@@ -27,16 +27,8 @@ def decoupled_fit(
 ) -> FloatArray:
     """Return the rotation from centred tags and its prior block (26), then the translation (27).
 
-    Parameters
-    ----------
-    mean, covariance
-        Prior (..., 12) and (..., 12, 12).
-    ranges, anchors, tags, weights
-        As in `engines.LinearEpoch`, weights (..., M, 1) common to all tags.
-
-    Returns
-    -------
-    ``[vec Q; t]`` (..., 12), Q a rotation.
+    The prior is `mean` (..., 12) and `covariance` (..., 12, 12); the weights (..., M, 1) are common
+    to all tags. Returns ``[vec Q; t]`` (..., 12), Q a rotation.
     """
     stat = statistic(ranges, anchors, tags, weights)
     P_q = inverse(covariance[..., :9, :9])

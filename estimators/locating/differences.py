@@ -20,15 +20,8 @@ _DEPTH = 0.5
 def places_of_differences(part: RangeCost, net: FloatArray) -> FloatArray:
     """Return three positions (K, 3, 3) of the tags' centre that agree with range differences.
 
-    They are the ends of short local searches from a grid of positions among the anchors. Each
-    starts with the rotation of a net that fits best there.
-
-    Parameters
-    ----------
-    part
-        Trials (K, 1, ...).
-    net
-        Rotations (S, 3, 3).
+    They are the ends of short local searches from a grid of positions among the anchors, for trials
+    (K, 1, ...). Each starts with the rotation of the net (S, 3, 3) that fits best there.
     """
     anchors, tags = part.anchors[:, 0], part.tags[:, 0]
     middle = anchors.mean(axis=-2, keepdims=True)

@@ -68,14 +68,9 @@ def maximum_likelihood(
 ) -> tuple[Solution, Alternatives]:
     """Return the most likely pose, with a global search if the first solution is in doubt.
 
-    Parameters
-    ----------
-    cost
-        Least squares of the ranges, batch axis (B,).
-    rotation, translation
-        Starts (B, 3, 3), (B, 3); rows that are not finite are started globally.
-    tag_std_m
-        Standard deviation of the tag positions on the body, marginalised.
+    The cost is least squares of the ranges, batch axis (B,). Starts (B, 3, 3), (B, 3) that are not
+    finite are found globally. `tag_std_m` is the standard deviation of the tags on the body, which
+    is marginalised.
     """
     weights = cost.weights / (1 + tag_std_m**2 * cost.weights)
     if cost.offset is not None:
@@ -137,20 +132,9 @@ def most_likely_pose(
 ) -> tuple[Any, ...]:
     """Return `maximum_likelihood` as plain arrays, for the kernel.
 
-    Parameters
-    ----------
-    ranges, weights, anchors, tags
-        As in `RangeCost`.
-    rotation, translation
-        Starts; NaN for none.
-    net
-        Rotations (S, 3, 3) to search from.
-    room
-        (K, 6), for K alternatives; its values are not used.
-
-    Returns
-    -------
-    Rotation, translation, cost, gradient, Hessian, converged, and three arrays of alternatives.
+    Arrays are as in `RangeCost`; starts are NaN for none; `net` (S, 3, 3) are rotations to search
+    from; of `room` (K, 6), for K alternatives, only the shape is used. Returns rotation,
+    translation, cost, gradient, Hessian, converged, and three arrays of alternatives.
     """
     return _most_likely_pose(RangeCost(ranges, weights, anchors, tags), rotation, translation, net)
 
@@ -200,16 +184,10 @@ def in_doubt(cost: RangeCost, at: Linearization) -> BoolArray:
 def search(
     part: RangeCost, first: tuple[FloatArray, FloatArray], usable: BoolArray, net: FloatArray
 ) -> tuple[Solution, Alternatives]:
-    """Return the best of many local searches, and its rivals.
+    """Return the best of many local searches of trials (K, 1, ...), and its rivals.
 
-    Parameters
-    ----------
-    part
-        Trials (K, 1, ...).
-    first, usable
-        Known solutions (K, 3, 3), (K, 3), and which of them are valid.
-    net
-        Rotations (S, 3, 3) to start from.
+    `first` are known solutions (K, 3, 3), (K, 3), where `usable`; `net` (S, 3, 3) the rotations to
+    start from.
     """
     fine = local_minima(part, first, usable, net)
     best = cheapest(fine)

@@ -130,15 +130,8 @@ def search_places(
 ) -> Places:
     """Search for tag positions (B, K, 3), y >= 0; return them and the step of convergence.
 
-    Parameters
-    ----------
-    search
-        The search.
-    angles, tags, angle_std_rad
-        (B, 2, K), (B, K, 3) and (B,): directions, tags in the body frame, standard deviation of
-        the angles.
-    rng
-        Random generator.
+    Directions are (B, 2, K), tags in the body frame (B, K, 3), standard deviations of the angles
+    (B,).
     """
     unit = body_size(tags)
     rays = bearing.directions(angles)

@@ -88,16 +88,9 @@ class Factor(Protocol):
 class Equations:
     """Normal equations ``H x = -g`` of a log; `Rows` and priors are added in place.
 
-    Attributes
-    ----------
-    diagonal, above
-        Blocks (..., K, n, n) of the epochs, and of each epoch with the next. The last is unused.
-    gradient
-        (..., K, n).
-    border, corner, corner_gradient
-        (..., K, n, c), (..., c, c), (..., c): blocks of the constants.
-    cost
-        (...).
+    `diagonal` and `above` (..., K, n, n) are blocks of the epochs, and of each epoch with the next;
+    the last is unused. `gradient` is (..., K, n). `border` (..., K, n, c), `corner` (..., c, c) and
+    `corner_gradient` (..., c) are blocks of the constants.
     """
 
     diagonal: FloatArray

@@ -22,16 +22,9 @@ _LEAST_NEW = 1e-12
 class BiasBlock(NamedTuple):
     """Biases of one kind: one per link, one common to all links, or clock offsets.
 
-    Attributes
-    ----------
-    where
-        Their slice of the extra states of an epoch, or of the constants.
-    of_link
-        Index of the bias of each of the M N links.
-    std
-        Standard deviation, metres.
-    time_s
-        Correlation time of the drift. None: constant biases. Infinite: clock offsets (`clocks`).
+    `where` is their slice of the extra states of an epoch, or of the constants; `of_link` the index
+    of the bias of each of the M N links; `std` in metres. `time_s` is the correlation time of the
+    drift; None: constant biases; infinite: clock offsets (`clocks`).
     """
 
     where: slice

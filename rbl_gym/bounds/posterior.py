@@ -79,23 +79,11 @@ def step_of_ranges(
 ) -> tuple[FloatArray, FloatArray]:
     """Return information (..., 6, 6) after an epoch of ranges, and the score (...) of its inverse.
 
-    Parameters
-    ----------
-    prior
-        Information (..., 6, 6) after the previous epoch.
-    twist, dt, std
-        Known twist (..., 6) and length of the interval since then, 0 for no interval; standard
-        deviations (6,) of the process noise after 1 s.
-    anchors, tags, rotation, translation
-        (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3) at this epoch; the pose is the true one.
-    law
-        Numbers of the noise law (`ranging.numbers_of`).
-    share
-        (..., M, N), share of its information that each link has.
-
-    Returns
-    -------
-    The score is NaN if the information is not positive definite.
+    `prior` (..., 6, 6) is the information after the previous epoch. The twist (..., 6) of the
+    interval `dt` since then is known; 0 for no interval. `std` (6,) are the standard deviations of
+    the process noise after 1 s, `law` the numbers of the noise law (`ranging.numbers_of`), `share`
+    (..., M, N) the share of its information that each link has. The pose is the true one. The score
+    is NaN if the information is not positive definite.
     """
     noise = ranging.law_of(law)
     told = information.information_at(anchors, tags, rotation, translation, noise, share)

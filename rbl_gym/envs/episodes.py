@@ -100,19 +100,8 @@ class EpisodeStore:
 class FamilyStore:
     """The running episodes of B worlds with different scenes, see `EpisodeStore`.
 
-    World i draws its scene, then its episode, in the same order as the scalar environment.
-
-    Parameters
-    ----------
-    family, num_envs
-        The family, and B.
-    in_turn
-        Whether worlds take the members of the family in turn instead of drawing them.
-
-    Attributes
-    ----------
-    stack
-        The scenes of the worlds.
+    World i draws its scene, then its episode, in the same order as the scalar environment. With
+    `in_turn` worlds take the members of the family in turn instead. `stack` has the scenes.
     """
 
     def __init__(self, family: SceneFamily, num_envs: int, in_turn: bool = False) -> None:

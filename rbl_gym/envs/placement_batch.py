@@ -257,17 +257,8 @@ def _mirrored_mounts(task: PlacementTask, mounts: FloatArray) -> np.ndarray:
 class View:
     """How a task presents the problems of B worlds: mirrored, and scaled to about [-1, 1].
 
-    Parameters
-    ----------
-    task
-        The task.
-    low, high
-        Corners (3,) of the space to which boxes are scaled.
-
-    Attributes
-    ----------
-    middle
-        Fixed point (3,) of the mirroring.
+    Boxes are scaled to the space of the corners `low` and `high` (3,). `middle` (3,) is the fixed
+    point of the mirroring.
     """
 
     def __init__(self, task: PlacementTask, low: FloatArray, high: FloatArray) -> None:

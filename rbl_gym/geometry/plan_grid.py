@@ -17,13 +17,8 @@ _MARGIN_M, _MARGIN = 1e-6, 1e-12
 class PlanGrid(NamedTuple):
     """A grid of square cells; the cells at the edge extend to infinity.
 
-    Attributes
-    ----------
-    cells
-        (5,): corner x, y of the first cell, length of a side, numbers of columns and rows.
-    starts, members
-        The obstacles of cell ``c = row * columns + column`` are ``members[starts[c] :
-        starts[c + 1]]``.
+    `cells` (5,) are corner x, y of the first cell, length of a side, numbers of columns and rows.
+    The obstacles of cell ``c = row * columns + column`` are ``members[starts[c] : starts[c + 1]]``.
     """
 
     cells: FloatArray

@@ -204,15 +204,9 @@ def propagate(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return state and covariance after the samples of an interval.
 
-    Parameters
-    ----------
-    rotation, translation, extra, covariance
-        (..., 3, 3), (..., 3), (..., K), (..., 6 + K, 6 + K). `extra`: velocity, biases, the tilt
-        of gravity (2) if the last entry of `law` is not 0, and constant states.
-    readings, steps
-        (..., S, 6) and seconds (..., S).
-    law
-        (6,): `InertialSensor.numbers`, and whether the tilt is a state.
+    `extra` (..., K) are velocity, biases, the tilt of gravity (2) if the last entry of `law` is not
+    0, and constant states; `covariance` is (..., 6 + K, 6 + K). `readings` (..., S, 6) last `steps`
+    (..., S) seconds each. `law` (6,) is `InertialSensor.numbers`, and whether the tilt is a state.
     """
     tilted = law[5] != 0
     down = np.array([0.0, 0.0, -law[4]])

@@ -45,16 +45,9 @@ def linked_covariance(
 ) -> FloatArray:
     """Return the orientation bound (..., n - 1, n - 1) of networks that may be disconnected.
 
-    Nodes without a path to node 0 keep their prior: their links give no information on node 0.
-
-    Parameters
-    ----------
-    links
-        (..., n, n) symmetric: the pairs that see each other.
-    bearing_std_rad
-        sigma of a bearing; (..., 1, 1) for several networks.
-    prior_std_rad
-        Prior standard deviation of an orientation without measurements; it keeps the bound finite.
+    `links` (..., n, n) are the pairs that see each other. Nodes without a path to node 0 keep their
+    prior, which keeps the bound finite: their links give no information on node 0.
+    `bearing_std_rad` may be (..., 1, 1) for several networks.
     """
     weight = linked_to_0(links) / (2 * bearing_std_rad**2)
     information = np.eye(links.shape[-1]) * (weight.sum(axis=-1) + prior_std_rad**-2)[..., None]

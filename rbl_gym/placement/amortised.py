@@ -74,18 +74,8 @@ def read(path: Any) -> Network:
 class _Play(NamedTuple):
     """A problem with all that the network needs.
 
-    Attributes
-    ----------
-    seen
-        Input of the network.
-    judge
-        The score at the places of `seen`.
-    held
-        Obstacles in which no anchor may be.
-    open
-        Whether nothing is in the way.
-    count
-        Number of anchors to place.
+    `judge` is the score at the places of `seen`, `held` the obstacles in which no anchor may be,
+    `open` whether nothing is in the way, `count` the number of anchors to place.
     """
 
     seen: Scenery

@@ -187,14 +187,8 @@ def refresh(
 class Bound(NamedTuple):
     """What gives the score of a layout.
 
-    Attributes
-    ----------
-    setting
-        The problem.
-    spread
-        Mean of ``J_n^T J_n`` (P, 6, 6).
-    candidates
-        Upper halves of the information of each candidate alone, (..., P, 21, C).
+    `spread` is the mean of ``J_n^T J_n`` (P, 6, 6); `candidates` (..., P, 21, C) are upper halves
+    of the information of each candidate alone.
     """
 
     setting: Setting

@@ -139,15 +139,7 @@ class _Arrays(NamedTuple):
 
 
 class StackedTasks:
-    """The stacked tasks of B worlds, and their problems.
-
-    Parameters
-    ----------
-    family
-        The family from which the tasks are drawn.
-    num_envs
-        Number of worlds B. All have the first task of the family until `begin`.
-    """
+    """The stacked tasks of B worlds, and their problems; the first of the family until `begin`."""
 
     def __init__(self, family: TaskFamily, num_envs: int) -> None:
         self.family = family

@@ -20,14 +20,7 @@ _MOST_POINTS = 10_000
 def read_table(name: str, table: Any, kind: str | None = None) -> dict[str, Any]:
     """Return the checked values of one table, with defaults; a ValueError names what is wrong.
 
-    Parameters
-    ----------
-    name
-        Name in errors, such as ``"walls[3]"``.
-    table
-        The value in the file.
-    kind
-        Its name in `FORMAT`; None: the same as `name`.
+    `name` is for errors, such as ``"walls[3]"``; `kind` its name in `FORMAT`, None: the same.
     """
     table = as_table(table, name)
     keys = _form(name, table, FORMAT[kind or name].forms).keys

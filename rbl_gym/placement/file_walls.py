@@ -51,14 +51,9 @@ def read_obstacles(
 ) -> tuple[Obstacles, WallPieces]:
     """Return all obstacles, and the walls piece by piece.
 
-    Parameters
-    ----------
-    tables
-        The tables ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``.
-    materials
-        Information fractions by name; they override those of the standard materials.
-    blocked
-        Information fraction of obstacles without their own.
+    `tables` are ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``. `materials`
+    are information fractions by name, which override those of the standard materials; `blocked` is
+    that of obstacles without their own.
     """
     boxes, solids, walls = [], Solids([], [], [], []), []
     for name, table in _each(tables, "obstacles"):

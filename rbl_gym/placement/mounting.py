@@ -26,18 +26,9 @@ _LEAST_M, _LEAST_M2 = 1e-3, 1e-4
 class Mount(NamedTuple):
     """A face as given in a file: a segment (2, 2), a polygon (V, 2) or a point (1, 2) in plan.
 
-    Attributes
-    ----------
-    shape
-        Corners in plan, metres.
-    low_m, high_m
-        Heights.
-    normal
-        Unit vector of the view of its anchors; zero for all directions.
-    cost, name
-        Cost and name of an anchor on it.
-    on_surface
-        Whether it is a surface with a front side, not a volume.
+    `normal` is the unit vector of the view of its anchors; zero for all directions. `cost` and
+    `name` are those of an anchor on it. `on_surface`: whether it has a front side, and is not a
+    volume.
     """
 
     shape: FloatArray

@@ -153,20 +153,10 @@ def told_reading(
     quality: FloatArray | None,
     first: bool,
 ) -> Reading:
-    """Return the input of filters for one epoch.
+    """Return the input of filters for one epoch; the first has no twist.
 
-    Parameters
-    ----------
-    told
-        The scene as known to filters.
-    at, measured
-        The epoch, and the measurements.
-    anchors
-        Anchor positions (..., M, 3) known to filters.
-    quality
-        Share (..., M) of their information that links keep; None: all of it.
-    first
-        Whether the epoch is the first, without a twist.
+    `told` is the scene as known to filters, as are the `anchors` (..., M, 3). `quality` (..., M) is
+    the share of their information that links keep; None: all of it.
     """
     law = None if quality is None else WeakenedNoise(told.noise, quality)
     twist, inertial = (None, None) if first else (at.twist, at.readings)

@@ -28,16 +28,9 @@ _KNOT_S = 1.0
 class InertialTrack(NamedTuple):
     """The motion of an episode at epochs 0 ... T, with leading axes.
 
-    Attributes
-    ----------
-    rotation, translation, velocity
-        (..., T + 1, 3, 3), (..., T + 1, 3), (..., T + 1, 3).
-    twists
-        Known twists (..., T, 6) of the interval that ends at each epoch, from epoch 1.
-    readings
-        (..., T + 1, S, 6), of the interval that ends at each epoch; zeros at epoch 0.
-    bias
-        (..., T + 1, 6) of the sensor at the epochs.
+    The known twists (..., T, 6) begin with epoch 1; the readings (..., T + 1, S, 6) are zeros at
+    epoch 0. Both are of the interval that ends at the epoch. `bias` (..., T + 1, 6) is that of the
+    sensor.
     """
 
     rotation: FloatArray

@@ -68,17 +68,7 @@ class _Arrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StackedScenes:
-    """The stacked scenes of B worlds.
-
-    Parameters
-    ----------
-    family
-        The family from which the scenes are drawn.
-    scenes
-        The B scenes.
-    arrays
-        Numbers of the scenes.
-    """
+    """The stacked scenes of B worlds, drawn from a family, and their numbers as arrays."""
 
     family: SceneFamily
     scenes: tuple[Scene, ...]

@@ -17,19 +17,10 @@ def centre_lines(
 ) -> tuple[list[tuple[FloatArray, float]], list[FloatArray]]:
     """Return centre lines of pairs of parallel segments, and the segments without a partner.
 
-    Parameters
-    ----------
-    lines
-        Points (n, 2) of each line, metres, and whether it is a ring.
-    widest
-        Maximum distance of the two lines of a wall, metres.
-
-    Returns
-    -------
-    pairs, single
-        Centre lines (2, 2) with the distance of their two lines, the closest pairs first; and
-        segments (2, 2) without a partner. Remaining pieces shorter than `widest`, such as the end
-        of a wall, are dropped.
+    `lines` are points (n, 2) of each line, and whether it is a ring; `widest` is the maximum
+    distance of the two lines of a wall. Centre lines (2, 2) come with the distance of their two
+    lines, the closest pairs first. Remaining pieces shorter than `widest`, such as the end of a
+    wall, are dropped.
     """
     segments = np.concatenate(
         [

@@ -149,18 +149,9 @@ def link_kinds(links: Links, rejected: BoolArray | None = None) -> np.ndarray:
 def tracked(
     label: str, filter: Filter, step: Step, tags: FloatArray, noise: NoiseLaw, truth: Pose | None
 ) -> Tracked:
-    """Return the result of a filter at an epoch.
+    """Return the result of a filter at a step of `studies.epochs.track_epochs`.
 
-    Parameters
-    ----------
-    label, filter
-        The filter.
-    step
-        A step of `studies.epochs.track_epochs`.
-    tags, noise
-        The tags (N, 3), and the noise law of the ranges if the epoch has none.
-    truth
-        The true pose, if known.
+    `noise` is the noise law of the ranges if the epoch has none; `truth` the true pose, if known.
     """
     ((_, found),) = innovations_of(filter, [step], tags, noise)
     found = Innovations(*(field[0] for field in found))

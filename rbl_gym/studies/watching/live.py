@@ -155,16 +155,8 @@ def moment_of(
 ) -> Moment:
     """Return an epoch with its measurements.
 
-    Parameters
-    ----------
-    scene, epoch, at
-        The scene, the epoch, and its number.
-    measured
-        The measurements.
-    anchors, told
-        True anchor positions (M, 3), and the positions that the filters assume.
-    quality
-        Share (M,) of its information that each link keeps; None if all keep all of it.
+    `anchors` are the true positions (M, 3), `told` those that the filters assume. `quality` (M,) is
+    the share of its information that each link keeps; None if all keep all of it.
     """
     links = Links(measured.links, measured.nlos, weak_links(measured.links, quality))
     reading = told_reading(scene, at, measured, told, quality, first=not epoch)
