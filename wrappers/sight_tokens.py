@@ -120,10 +120,7 @@ def sight_tokens(
 
     def framed(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         level = points[..., :2] - anchors[:, :, None, :2]
-        return (
-            (level * along[:, :, None]).sum(axis=-1),
-            (level * aside[:, :, None]).sum(axis=-1),
-        )
+        return ((level * along[:, :, None]).sum(axis=-1), (level * aside[:, :, None]).sum(axis=-1))
 
     (x, y), (x0, y0) = framed(place), framed(source)
     # Where the two lines of sight cross or are closest, and their vertical distance there.

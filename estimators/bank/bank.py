@@ -210,10 +210,7 @@ class IteratedEkfBank:
         return most if self.robust else np.minimum(most, links + _DEVIATIONS * np.sqrt(2 * links))
 
     def _scored(
-        self,
-        prior: PoseState,
-        epoch: _Epoch,
-        start: tuple[FloatArray, FloatArray] | None = None,
+        self, prior: PoseState, epoch: _Epoch, start: tuple[FloatArray, FloatArray] | None = None
     ) -> _Scored:
         """Return the update of trials (B,) and its cost, NaN if it has none."""
         start = start or self._filter.start(prior, *epoch)

@@ -36,11 +36,7 @@ class Clock(NamedTuple):
 
 
 def find_clock(
-    times: FloatArray,
-    ranges: FloatArray,
-    links: BoolArray,
-    distances: Places,
-    search_s: float,
+    times: FloatArray, ranges: FloatArray, links: BoolArray, distances: Places, search_s: float
 ) -> Clock | None:
     """Estimate the time shift at which distances along a path change as the ranges do.
 

@@ -17,11 +17,7 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, kernel
-from rbl_gym.estimators.costs.levenberg_marquardt import (
-    Linearization,
-    Solution,
-    minimize_pose,
-)
+from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.costs.losses import loss_of
 from rbl_gym.estimators.costs.map_problem import positive_inverse
 from rbl_gym.estimators.costs.unseen_directions import kept_wide

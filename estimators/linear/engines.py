@@ -14,12 +14,7 @@ import numpy as np
 from rbl_gym.bounds.pose import symmetric
 from rbl_gym.checks import HUGE, BoolArray, FloatArray, kernel
 from rbl_gym.estimators.filter import inverse
-from rbl_gym.estimators.linear.squared_range import (
-    Statistic,
-    compressed,
-    information,
-    statistic,
-)
+from rbl_gym.estimators.linear.squared_range import Statistic, compressed, information, statistic
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements.noise_laws import law_of
@@ -178,11 +173,7 @@ def transition(step: FloatArray) -> FloatArray:
 
 @compiled("linear_filter:compress")
 def compress(
-    ranges: FloatArray,
-    anchors: FloatArray,
-    tags: FloatArray,
-    weights: FloatArray,
-    like: FloatArray,
+    ranges: FloatArray, anchors: FloatArray, tags: FloatArray, weights: FloatArray, like: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return z (..., 12), H (..., 12, 12) as `squared_range.compressed`, with any factor H.
 

@@ -42,10 +42,7 @@ def unvec(vector: FloatArray) -> FloatArray:
 
 
 def procrustes(
-    weight: FloatArray,
-    target: FloatArray,
-    start: FloatArray,
-    retraction: str = "exponential",
+    weight: FloatArray, target: FloatArray, start: FloatArray, retraction: str = "exponential"
 ) -> tuple[FloatArray, FloatArray]:
     """Minimise ``(vec Q - q)^T W (vec Q - q) / 2`` over rotations by Newton's method on SO(3).
 

@@ -314,10 +314,7 @@ def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matri
 def _factorised(A: sp.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
     """Factorise a Hermitian matrix with diagonal pivots, in minimum-degree or natural order."""
     return scipy.sparse.linalg.splu(
-        sp.csc_matrix(A),
-        permc_spec=order,
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+        sp.csc_matrix(A), permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
 
 

@@ -19,10 +19,7 @@ __all__ = ["causal_track"]
 
 
 def causal_track(
-    filter: Filter,
-    log: RangeLog,
-    prior: Sequence[ArrayLike],
-    twists: ArrayLike | None = None,
+    filter: Filter, log: RangeLog, prior: Sequence[ArrayLike], twists: ArrayLike | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return rotations (..., K, 3, 3) and translations (..., K, 3) estimated by a filter.
 

@@ -20,10 +20,7 @@ def doa2019_figure(result: dict[str, Any]) -> Figure:
     settings = result["settings"]
     figure = new_figure(12, 3.3 * len(settings) + 0.6)
     axes = figure.subplots(len(settings), 3, squeeze=False)
-    curves = (
-        ("rotation_rmse", "RMSE(R), Frobenius"),
-        ("translation_rmse_m", "RMSE(t) [m]"),
-    )
+    curves = (("rotation_rmse", "RMSE(R), Frobenius"), ("translation_rmse_m", "RMSE(t) [m]"))
     for row, (label, data) in enumerate(settings.items()):
         sigma = data["sigma_deg"]
         paper = "Fig. 2, " if label == _PAPERS else ""
@@ -88,14 +85,7 @@ def print_doa2019(result: dict[str, Any]) -> None:
                     f"{row['time_ratio']:.1f}",
                 )
             bound = [data["bound"][key][k] for key in ("rotation_rmse", "translation_rmse_m")]
-            table.add_row(
-                f"{sigma:g}",
-                "bound",
-                f"{bound[0]:.5f}",
-                "1",
-                f"{bound[1]:.5f}",
-                "1",
-            )
+            table.add_row(f"{sigma:g}", "bound", f"{bound[0]:.5f}", "1", f"{bound[1]:.5f}", "1")
             table.add_section()
         out.print(table)
     out.print(

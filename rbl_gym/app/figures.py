@@ -258,12 +258,7 @@ def _common_legend(figure: Figure, axes: Any) -> None:
         for ax in axes.flat
         for handle, text in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(
-        handles.values(),
-        handles.keys(),
-        loc="outside lower center",
-        ncols=5,
-    )
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5)
 
 
 def ellipse(covariance: FloatArray) -> FloatArray:

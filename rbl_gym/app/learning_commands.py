@@ -6,13 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.app.terminal import (
-    add_json,
-    add_seed,
-    positive,
-    progress,
-    write_json,
-)
+from rbl_gym.app.terminal import add_json, add_seed, positive, progress, write_json
 from rbl_gym.checks import check_one_of
 from rbl_gym.studies.extras import MissingExtraError, require
 from rbl_gym.studies.learning.policies import AnyPolicy

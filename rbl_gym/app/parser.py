@@ -23,11 +23,7 @@ class _Help(argparse.HelpFormatter):
         """Wrap each line of a description; a list in it stays a list."""
         return "\n".join(
             textwrap.fill(
-                line,
-                width,
-                initial_indent=indent,
-                subsequent_indent=indent,
-                break_on_hyphens=False,
+                line, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
             )
             for line in text.splitlines()
         )

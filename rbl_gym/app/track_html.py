@@ -13,13 +13,7 @@ from rbl_gym.app import page, solids
 from rbl_gym.app.story import Story, chart_limits, enlargement, errors_of, freedom_of
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
-from rbl_gym.rendering.drawing import (
-    ANCHOR,
-    AXES,
-    INK,
-    body_edges,
-    gapped,
-)
+from rbl_gym.rendering.drawing import ANCHOR, AXES, INK, body_edges, gapped
 from rbl_gym.studies.epochs import nees_interval
 
 # Moments of the slider, and epochs of the curves; longer tracks are thinned out.
@@ -196,7 +190,7 @@ def _moving(
                 showlegend=False,
             ),
             (1, 1),
-        ),
+        )
     ]
     edges = body_edges(story.tags)
     if story.truth is not None:

@@ -17,14 +17,7 @@ from rbl_gym.bounds.tag_information import (
     raw_tag_information,
     squared_tag_information,
 )
-from rbl_gym.checks import (
-    FloatArray,
-    check_array,
-    check_links,
-    check_number,
-    check_one_of,
-    kernel,
-)
+from rbl_gym.checks import FloatArray, check_array, check_links, check_number, check_one_of, kernel
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets, ranging

@@ -15,10 +15,7 @@ __all__ = ["posterior_crb_step", "posterior_step"]
 
 
 def posterior_step(
-    J: ArrayLike,
-    epoch: RangeEpoch,
-    motion: Motion | None,
-    nuisances: Nuisances | None = None,
+    J: ArrayLike, epoch: RangeEpoch, motion: Motion | None, nuisances: Nuisances | None = None
 ) -> FloatArray:
     """Return the information after one step of the recursion, at the true pose.
 

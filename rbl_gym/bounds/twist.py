@@ -16,11 +16,7 @@ _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 def predict_covariance(
-    P: FloatArray,
-    twist: FloatArray,
-    dt: float,
-    process: ProcessNoise,
-    law: WanderingTwist | None,
+    P: FloatArray, twist: FloatArray, dt: float, process: ProcessNoise, law: WanderingTwist | None
 ) -> FloatArray:
     """Return the covariance (..., n, n) of n >= 12 states after `dt` s of a twist (..., 6).
 

@@ -11,12 +11,7 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.episodes import rows_of
-from rbl_gym.envs.placement_batch import (
-    PlacementBatchEnv,
-    PlacementScalarEnv,
-    View,
-    is_symmetric,
-)
+from rbl_gym.envs.placement_batch import PlacementBatchEnv, PlacementScalarEnv, View, is_symmetric
 from rbl_gym.envs.placement_views import PlacementViewLike
 from rbl_gym.placement.problem import Context, information_of_fixed, score_of_checked
 

@@ -11,21 +11,10 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.envs.placement_batch import (
-    PlacementBatchEnv,
-    PlacementScalarEnv,
-    View,
-    is_symmetric,
-)
+from rbl_gym.envs.placement_batch import PlacementBatchEnv, PlacementScalarEnv, View, is_symmetric
 from rbl_gym.envs.placement_views import PlacementViewLike
 from rbl_gym.geometry.regions import Walls
-from rbl_gym.placement.families import (
-    DESCRIBED,
-    StackedTasks,
-    TaskFamily,
-    described,
-    task_family,
-)
+from rbl_gym.placement.families import DESCRIBED, StackedTasks, TaskFamily, described, task_family
 from rbl_gym.placement.problem import Context
 
 

@@ -12,13 +12,7 @@ from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore, FamilyStore
-from rbl_gym.envs.tracking import (
-    action_space,
-    check_reward,
-    observation_space,
-    observed,
-    worlds_of,
-)
+from rbl_gym.envs.tracking import action_space, check_reward, observation_space, observed, worlds_of
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes

@@ -48,11 +48,7 @@ def vee(W: ArrayLike) -> FloatArray:
     """
     W = np.asarray(W, dtype=np.float64)
     return 0.5 * np.stack(
-        [
-            W[..., 2, 1] - W[..., 1, 2],
-            W[..., 0, 2] - W[..., 2, 0],
-            W[..., 1, 0] - W[..., 0, 1],
-        ],
+        [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]],
         axis=-1,
     )
 
@@ -96,11 +92,7 @@ def inverse_coefficient(squared: FloatArray) -> FloatArray:
 
 
 def _series(
-    w: FloatArray,
-    a: FloatArray,
-    b: FloatArray,
-    diagonal: FloatArray,
-    out: FloatArray | None = None,
+    w: FloatArray, a: FloatArray, b: FloatArray, diagonal: FloatArray, out: FloatArray | None = None
 ) -> FloatArray:
     """Return ``diagonal * I + a [w]x + b w w^T``, the common form of exp and its Jacobians."""
     M = np.empty((*w.shape, 3)) if out is None else out

@@ -21,13 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import (
-    FloatArray,
-    check_array,
-    check_generator,
-    check_number,
-    check_one_of,
-)
+from rbl_gym.checks import FloatArray, check_array, check_generator, check_number, check_one_of
 from rbl_gym.geometry import rotations
 
 __all__ = [

@@ -360,10 +360,7 @@ def check_law(name: str, noise: Any) -> None:
 
 
 # Noise laws by their names in scene files and overrides.
-NOISE_LAWS: dict[str, type[NoiseLaw]] = {
-    "range": RangeNoise,
-    "squared-range": SquaredRangeNoise,
-}
+NOISE_LAWS: dict[str, type[NoiseLaw]] = {"range": RangeNoise, "squared-range": SquaredRangeNoise}
 # Other ways to specify one of these laws.
 NOISE_FORMS: dict[str, Callable[..., NoiseLaw]] = {
     **NOISE_LAWS,

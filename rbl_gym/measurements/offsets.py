@@ -72,11 +72,7 @@ class Clock:
 
 
 def simulate_clocks(
-    law: Clock,
-    times: ArrayLike,
-    groups: int,
-    rng: np.random.Generator,
-    batch: tuple[int, ...] = (),
+    law: Clock, times: ArrayLike, groups: int, rng: np.random.Generator, batch: tuple[int, ...] = ()
 ) -> FloatArray:
     """Simulate offsets (..., K, groups) in metres at times (K,), from the law about zero.
 

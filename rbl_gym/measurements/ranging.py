@@ -14,14 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import (
-    BoolArray,
-    FloatArray,
-    check_generator,
-    check_number,
-    checked,
-    kernel,
-)
+from rbl_gym.checks import BoolArray, FloatArray, check_generator, check_number, checked, kernel
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.noise_laws import (

@@ -13,14 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import (
-    Axes,
-    FloatArray,
-    check_axes,
-    check_number,
-    checked,
-    kernel,
-)
+from rbl_gym.checks import Axes, FloatArray, check_axes, check_number, checked, kernel
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 

@@ -32,13 +32,7 @@ from rbl_gym.checks import (
 from rbl_gym.geometry import rotations
 from rbl_gym.motion.kinematics import ProcessNoise, check_process, six
 
-__all__ = [
-    "FRAMES",
-    "TwistSensor",
-    "WanderingPath",
-    "WanderingTwist",
-    "simulate_wandering",
-]
+__all__ = ["FRAMES", "TwistSensor", "WanderingPath", "WanderingTwist", "simulate_wandering"]
 
 FRAMES = ("world", "body")
 

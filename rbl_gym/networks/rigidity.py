@@ -18,12 +18,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.geometry import rotations
-from rbl_gym.networks.bounds import (
-    bearing_jacobian,
-    range_jacobian,
-    space_jacobian,
-    sparse_rows,
-)
+from rbl_gym.networks.bounds import bearing_jacobian, range_jacobian, space_jacobian, sparse_rows
 from rbl_gym.networks.edges import check_edges
 from rbl_gym.networks.graphs import check_connected, components
 from rbl_gym.networks.sensing import check_positions, directions_of

@@ -26,14 +26,7 @@ from rbl_gym.placement.building import Problem, cube
 from rbl_gym.placement.descent import follow
 from rbl_gym.placement.problem import Context, PlacementTask, link_shares
 from rbl_gym.placement.sample import sample
-from rbl_gym.placement.tokens import (
-    KINDS,
-    Scenery,
-    shown_of,
-    tokens_of,
-    turned,
-    turned_points,
-)
+from rbl_gym.placement.tokens import KINDS, Scenery, shown_of, tokens_of, turned, turned_points
 
 __all__ = ["Network", "load", "of_problem", "of_task", "read"]
 
@@ -177,10 +170,7 @@ def _swapped(network: Network, play: _Play, evaluations: int) -> tuple[FloatArra
 
 
 def of_task(
-    task: PlacementTask,
-    context: Context,
-    evaluations: int = 0,
-    network: Network | None = None,
+    task: PlacementTask, context: Context, evaluations: int = 0, network: Network | None = None
 ) -> FloatArray:
     """Return layouts (..., M, 3) of a task in contexts (...).
 

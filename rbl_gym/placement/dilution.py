@@ -103,11 +103,7 @@ def prior_of(seen: Scenery) -> FloatArray:
 
 
 def exchanged(
-    weight: FloatArray,
-    prior: FloatArray,
-    parts: Parts,
-    allowed: BoolArray,
-    most: int,
+    weight: FloatArray, prior: FloatArray, parts: Parts, allowed: BoolArray, most: int
 ) -> FloatArray:
     """Return anchors (..., M, 3) after exchanges, the best one each time.
 

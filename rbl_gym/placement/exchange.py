@@ -127,10 +127,7 @@ def _square_and_slope(spread: FloatArray, information: FloatArray) -> tuple[Floa
 
 
 def refresh(
-    setting: Setting,
-    anchors: FloatArray,
-    rng: np.random.Generator,
-    each: int = 8,
+    setting: Setting, anchors: FloatArray, rng: np.random.Generator, each: int = 8
 ) -> tuple[FloatArray, float]:
     """Do one round of fresh candidates: each anchor moves to its best one if that helps.
 

@@ -97,8 +97,7 @@ _BOX = {
 _SHARE: dict[str, Any] = {"low": 0.0, "high": 1.0}
 _LOSS = {
     "material": Key(
-        "text",
-        "one of [materials] or a standard material; opaque without material and information",
+        "text", "one of [materials] or a standard material; opaque without material and information"
     ),
     "information": Key(
         "number", "share of the information that remains, in place of material", **_SHARE
@@ -140,12 +139,7 @@ _KIND = Key("choice", "shape of the space for anchors", needed=True)
 _ZONE = {
     "name": _NAME,
     "weight": Key("number", "weight in the score", default=1.0, low=1e-6, high=1e6),
-    "attitude": Key(
-        "choice",
-        "possible rotations of the body",
-        default="free",
-        choices=ATTITUDES,
-    ),
+    "attitude": Key("choice", "possible rotations of the body", default="free", choices=ATTITUDES),
     "position_m": _size(
         "requirement: largest standard deviation of the horizontal position, metres"
     ),

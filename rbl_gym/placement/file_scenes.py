@@ -49,8 +49,5 @@ def _read(path: str, changed_ns: int) -> Scene:
     fixed = as_tuples(found.fixed) if len(found.fixed) else ()
     every = len(fixed) == found.n_anchors
     return dataclasses.replace(
-        found.scene,
-        anchors=fixed if every else None,
-        fixed=() if every else fixed,
-        **_MOTION,
+        found.scene, anchors=fixed if every else None, fixed=() if every else fixed, **_MOTION
     )

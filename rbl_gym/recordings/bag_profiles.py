@@ -87,13 +87,13 @@ _TYPES: dict[str, dict[str, Table]] = {
         "sensor_msgs/msg/Imu": {
             "angular_velocity": "angular_velocity",
             "linear_acceleration": "linear_acceleration",
-        },
+        }
     },
     "odometry": {
         "nav_msgs/msg/Odometry": {
             "velocity": "twist.twist.linear",
             "angular_velocity": "twist.twist.angular",
-        },
+        }
     },
 }
 # Types that are used only if a table names their topic: estimates, frame trees.

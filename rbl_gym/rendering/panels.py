@@ -166,12 +166,7 @@ class _CloseUp:
                                  ncols=3, columnspacing=1.2, **_LEGEND)  # fmt: skip
 
     def paint(
-        self,
-        path: FloatArray,
-        true: Pose,
-        belief: Pose | None,
-        shown: Pose | None,
-        picture: Image,
+        self, path: FloatArray, true: Pose, belief: Pose | None, shown: Pose | None, picture: Image
     ) -> None:
         """Draw `path` (K, 3) up to now, the pose and its belief; `shown` scales both."""
         place = true.translation

@@ -196,10 +196,7 @@ _LAWS: dict[str, _Law] = {
         lambda value: 1,
     ),
     "integers": _Law(
-        _check_integers,
-        _draw_integer,
-        _ends_of_integers,
-        lambda value: len(set(value)),
+        _check_integers, _draw_integer, _ends_of_integers, lambda value: len(set(value))
     ),
     "choice": _Law(
         _check_choice,

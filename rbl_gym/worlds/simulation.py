@@ -119,8 +119,7 @@ def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) ->
 def empty_draws(scene: Scene, count: int) -> Draws:
     """Return arrays for the random numbers of `count` episodes, (count, n) and (count, m)."""
     return Draws(
-        np.empty((count, sum(_normal_sizes(scene)))),
-        np.empty((count, sum(_uniform_sizes(scene)))),
+        np.empty((count, sum(_normal_sizes(scene)))), np.empty((count, sum(_uniform_sizes(scene))))
     )
 
 

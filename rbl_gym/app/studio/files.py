@@ -172,11 +172,7 @@ def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
     ]
     named = {"name": state.problem.name, **tables}
     changed = {key: value for key, value in named.items() if key != "$schema"}
-    changed["anchors"] = {
-        **tables.get("anchors", {}),
-        "number": len(anchors),
-        "fixed": anchors,
-    }
+    changed["anchors"] = {**tables.get("anchors", {}), "number": len(anchors), "fixed": anchors}
     plan = state.world.base.plan
     if plan is not None and "plan" in tables:
         # Paths in a scene file are relative to its folder.

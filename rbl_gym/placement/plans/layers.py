@@ -234,12 +234,7 @@ class _Maker:
         ]
 
     def _rings(
-        self,
-        lines: list[Shape],
-        marks: list[Shape],
-        layer: str,
-        use: Use,
-        usual: dict[str, Any],
+        self, lines: list[Shape], marks: list[Shape], layer: str, use: Use, usual: dict[str, Any]
     ) -> Any:
         rows, failed = [], 0
         for line in lines:

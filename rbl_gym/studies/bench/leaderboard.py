@@ -76,10 +76,7 @@ def further_filters(spec: str | Mapping[str, Any]) -> list[str]:
     further = ["iekf-imu", "iekf-imu/robust=true"] if scene.inertial is not None else []
     if scene.survey_std_m > 0:
         std = f"{scene.survey_std_m:g}"
-        further += [
-            f"iekf/anchor_std_m={std}",
-            f"iekf-bias/bias_std_m={std}/common_std_m=0",
-        ]
+        further += [f"iekf/anchor_std_m={std}", f"iekf-bias/bias_std_m={std}/common_std_m=0"]
     return further
 
 

@@ -17,12 +17,7 @@ from rbl_gym.studies.backends import HERE, Workers
 from rbl_gym.studies.bench import leaderboard
 from rbl_gym.studies.bench.leaderboard import Task
 
-__all__ = [
-    "read_records",
-    "read_timings",
-    "rerun",
-    "run_tasks",
-]
+__all__ = ["read_records", "read_timings", "rerun", "run_tasks"]
 
 Records = list[dict[str, Any]]
 # Fields that all records of a file share.

@@ -6,11 +6,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.calibration import KnownPath, LinkFit, LinkModel, fit_links
-from rbl_gym.estimators.calibration.harmonics import (
-    FoundDirections,
-    candidates_of,
-    fit_harmonics,
-)
+from rbl_gym.estimators.calibration.harmonics import FoundDirections, candidates_of, fit_harmonics
 from rbl_gym.measurements.direction_bias import direction_bias
 from rbl_gym.studies.calibrate.known_path import Log, path_at
 from rbl_gym.studies.calibrate.settings import LinkSettings

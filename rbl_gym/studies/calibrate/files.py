@@ -69,9 +69,7 @@ def write_points(
 
 
 def write_directions(
-    path: str | os.PathLike[str],
-    ids: tuple[Sequence[str], Sequence[str]],
-    law: DirectionLaw,
+    path: str | os.PathLike[str], ids: tuple[Sequence[str], Sequence[str]], law: DirectionLaw
 ) -> None:
     """Write ``end,id,harmonic,bias_cos_m,...``, as `rbl_gym.recordings.read_directions` reads it.
 

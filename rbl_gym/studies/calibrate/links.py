@@ -22,11 +22,7 @@ from rbl_gym.estimators.calibration.link_equations import (
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.directed import fit_log, with_directions
-from rbl_gym.studies.calibrate.files import (
-    write_directions,
-    write_link_table,
-    write_points,
-)
+from rbl_gym.studies.calibrate.files import write_directions, write_link_table, write_points
 from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_of, path_at
 from rbl_gym.studies.calibrate.settings import LinkSettings
 

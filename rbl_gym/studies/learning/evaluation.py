@@ -25,13 +25,7 @@ from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.wrappers import controllers
 
-__all__ = [
-    "Layouts",
-    "evaluate",
-    "held_out_returns",
-    "layouts_of",
-    "references",
-]
+__all__ = ["Layouts", "evaluate", "held_out_returns", "layouts_of", "references"]
 
 # The reference with one layout for all contexts, and the number of contexts for its search.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64

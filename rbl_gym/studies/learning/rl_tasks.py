@@ -11,11 +11,7 @@ import gymnasium as gym
 from rbl_gym.checks import check_one_of
 from rbl_gym.worlds.families import SceneFamily, family
 
-__all__ = [
-    "TASKS",
-    "RlTask",
-    "rl_task",
-]
+__all__ = ["TASKS", "RlTask", "rl_task"]
 
 # Worlds of a training or evaluation have the seeds from SEED_STRIDE times its own seed on. Seeds of
 # evaluations lie beyond those of all trainings.

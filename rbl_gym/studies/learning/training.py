@@ -86,10 +86,7 @@ def train(
     finally:
         torch.set_num_threads(threads)
     meta = {"task": name, "seed": seed, "steps": steps, "algorithm": algorithm}
-    seconds = {
-        "seconds": time.perf_counter() - begin,
-        "cpu_seconds": time.process_time() - cpu,
-    }
+    seconds = {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
     return make(meta), {**meta, **seconds, **figures}
 
 

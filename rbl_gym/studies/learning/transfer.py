@@ -233,11 +233,7 @@ def transfer_layouts(
 
 
 def track_layouts(
-    groups: list[Layouts],
-    filters: list[str],
-    repeats: int,
-    seed: int,
-    advance: Advance = silent,
+    groups: list[Layouts], filters: list[str], repeats: int, seed: int, advance: Advance = silent
 ) -> dict[str, Any]:
     """Return scores and filter errors of layouts. All layouts meet the same bodies.
 

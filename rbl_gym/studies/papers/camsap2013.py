@@ -22,14 +22,7 @@ from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
-__all__ = [
-    "FILTERS",
-    "Claim",
-    "Example",
-    "example",
-    "paper_scene",
-    "tracking_experiment",
-]
+__all__ = ["FILTERS", "Claim", "Example", "example", "paper_scene", "tracking_experiment"]
 
 Filters = Mapping[str, tuple[str, dict[str, Any]]]
 

@@ -24,9 +24,7 @@ from rbl_gym.measurements import bearing
 from rbl_gym.studies.monte_carlo import rms
 from rbl_gym.studies.progress import Advance, silent
 
-__all__ = [
-    "doa_experiment",
-]
+__all__ = ["doa_experiment"]
 
 METHODS = {"NIA + UQ": "nia", "ML": "ml", "PSO": "pso", "PSA": "psa"}
 SIGMAS_DEG = (0.01, 0.1, 1.0)
@@ -74,11 +72,7 @@ def doa_experiment(trials: int, seed: int, advance: Advance = silent) -> dict[st
 
 
 def _noise(
-    label: str,
-    sigma_deg: float,
-    trials: int,
-    rng: np.random.Generator,
-    advance: Advance,
+    label: str, sigma_deg: float, trials: int, rng: np.random.Generator, advance: Advance
 ) -> dict[str, dict[str, float]]:
     """Return the figures of all methods and the bound at one noise level."""
     tags, noise = bodies.doa2019(), bearing.AngleNoise(np.deg2rad(sigma_deg))
@@ -88,10 +82,7 @@ def _noise(
     angles = bearing.simulate(tags, rotation, TRANSLATION, noise, rng)
     bound = _of_covariance(doa.doa_crb(tags, rotation, TRANSLATION, noise))
     rows: dict[str, dict[str, float]] = {
-        "bound": {
-            "rotation_rmse": float(rms(bound[0])),
-            "translation_rmse_m": float(rms(bound[1])),
-        }
+        "bound": {"rotation_rmse": float(rms(bound[0])), "translation_rmse_m": float(rms(bound[1]))}
     }
     for name, method in METHODS.items():
         start = time.process_time()

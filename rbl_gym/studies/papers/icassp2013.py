@@ -18,12 +18,7 @@ from rbl_gym.studies.monte_carlo import rms
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes
 
-__all__ = [
-    "METHODS",
-    "Setting",
-    "static_experiment",
-    "static_settings",
-]
+__all__ = ["METHODS", "Setting", "static_experiment", "static_settings"]
 
 METHODS = {
     "LS": "ls",
@@ -79,11 +74,7 @@ def static_settings() -> dict[str, Setting]:
 
 
 def static_experiment(
-    name: str,
-    settings: dict[str, Setting],
-    trials: int,
-    seed: int,
-    advance: Advance = silent,
+    name: str, settings: dict[str, Setting], trials: int, seed: int, advance: Advance = silent
 ) -> dict[str, Any]:
     """Run every method at every reference range of every setting, and compute the bounds.
 
@@ -137,11 +128,7 @@ def _columns(rows: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def _epoch(
-    setting: Setting,
-    db: int,
-    trials: int,
-    rng: np.random.Generator,
-    advance: Advance,
+    setting: Setting, db: int, trials: int, rng: np.random.Generator, advance: Advance
 ) -> dict[str, dict[str, float]]:
     """Return the figures of all methods and bounds at one reference range."""
     scene = scenes.SCENES["icassp2013"]

@@ -29,10 +29,7 @@ from rbl_gym.networks.sensing import check_positions, proj, unit_disk_edges
 from rbl_gym.studies.papers import network_growth
 from rbl_gym.studies.progress import Advance, silent
 
-__all__ = [
-    "network_experiment",
-    "read_points",
-]
+__all__ = ["network_experiment", "read_points"]
 
 # Node 0, the reference, is at the bottom left, as in Fig. 6.
 PLACES = np.array(

@@ -18,10 +18,7 @@ from rbl_gym.estimators.networks.triangle import TRIANGLE_EDGES
 from rbl_gym.geometry import rotations
 from rbl_gym.networks import bounds, sensing
 
-__all__ = [
-    "kappa_growth",
-    "three_in_space",
-]
+__all__ = ["kappa_growth", "three_in_space"]
 
 WORST_SIZES = (6, 8, 11, 16, 23, 32)
 TRIANGULATION_SIZES = (10, 20, 40, 80, 160, 320)

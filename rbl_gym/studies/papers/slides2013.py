@@ -19,11 +19,7 @@ from rbl_gym.studies.papers.icassp2013 import Setting
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds.scene import Scene
 
-__all__ = [
-    "slides_experiment",
-    "slides_scene",
-    "slides_settings",
-]
+__all__ = ["slides_experiment", "slides_scene", "slides_settings"]
 
 TAGS = bodies.centred([[0, 0, 0], [5, 0, 0], [5, 4, 0], [0, 4, 0], [2.5, 2, 5]])
 # Four alternate corners of a cube, the best layout of four anchors.

@@ -12,12 +12,7 @@ from rbl_gym.placement.sample import prior_of
 from rbl_gym.studies.placing.links import anchor_information, layout_information
 from rbl_gym.studies.placing.requirements import Errors, errors_of, turns
 
-__all__ = [
-    "Map",
-    "accuracy",
-    "accuracy_map",
-    "accuracy_without_each",
-]
+__all__ = ["Map", "accuracy", "accuracy_map", "accuracy_without_each"]
 
 # Number of rotations of the body over which the accuracy at a position is averaged.
 TURNS = 9
@@ -125,10 +120,7 @@ class Map(NamedTuple):
 
 
 def accuracy_map(
-    problem: Problem,
-    anchors: FloatArray,
-    share: float = 0.5,
-    zone: Zone | None = None,
+    problem: Problem, anchors: FloatArray, share: float = 0.5, zone: Zone | None = None
 ) -> Map:
     """Return the accuracy over x and y at one height of a zone.
 

@@ -18,11 +18,7 @@ from rbl_gym.studies.placing.accuracy import draw_places
 from rbl_gym.studies.placing.judging import limits_of
 from rbl_gym.studies.placing.links import link_shares
 
-__all__ = [
-    "DrawnBodies",
-    "check_layout",
-    "draw_bodies",
-]
+__all__ = ["DrawnBodies", "check_layout", "draw_bodies"]
 
 # A pose is lost if a consistent belief would be this far from the truth once in a million, for
 # instance the mirror image behind a plane of anchors.
@@ -230,10 +226,7 @@ def _figures(
     # The bound must agree: an overconfident filter must not hide its errors as lost poses.
     kept = known & ~((nees > _LOST_NEES) & (metrics.nees(error, bound) > _LOST_NEES))
     variance = np.einsum("bii->bi", bound)
-    result: dict[str, Any] = {
-        "found": float(kept.mean()),
-        "without_pose": float(1 - known.mean()),
-    }
+    result: dict[str, Any] = {"found": float(kept.mean()), "without_pose": float(1 - known.mean())}
     for of, rows in (("", known), ("_found", kept)):
         if not rows.any():
             continue
@@ -259,10 +252,7 @@ def _figures(
     return result
 
 
-_PARTS = (
-    ("position", slice(3, 6), "m", 1.0),
-    ("rotation", slice(3), "deg", 180 / np.pi),
-)
+_PARTS = (("position", slice(3, 6), "m", 1.0), ("rotation", slice(3), "deg", 180 / np.pi))
 
 
 def _zones(

@@ -179,11 +179,7 @@ def first_then_others(anchors: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def fewest_anchors(
-    problem: Problem,
-    numbers: range,
-    seed: int,
-    survive: int = 0,
-    advance: Advance = silent,
+    problem: Problem, numbers: range, seed: int, survive: int = 0, advance: Advance = silent
 ) -> Fewest:
     """Find the smallest number of anchors that meets the requirements of all zones.
 

@@ -15,12 +15,7 @@ from rbl_gym.placement.problem import Context
 from rbl_gym.studies.placing import judging
 from rbl_gym.studies.progress import Advance, silent
 
-__all__ = [
-    "STARTS",
-    "Design",
-    "design_layout",
-    "usual_layouts",
-]
+__all__ = ["STARTS", "Design", "design_layout", "usual_layouts"]
 
 # Methods of the search: `placement.design`, or `placement.amortised` with this many steps.
 STARTS, _EVALUATIONS = ("search", "amortised"), 20

@@ -2,11 +2,7 @@
 
 from rbl_gym.studies.replay.causes import Cause, likely_causes
 from rbl_gym.studies.replay.clocks import CLOCK_TRIALS, SensorClock, sensor_clock
-from rbl_gym.studies.replay.consistency import (
-    contradicts,
-    nis_curve,
-    residual_tables,
-)
+from rbl_gym.studies.replay.consistency import contradicts, nis_curve, residual_tables
 from rbl_gym.studies.replay.figures import track_figures
 from rbl_gym.studies.replay.inertial import covered
 from rbl_gym.studies.replay.judging import (

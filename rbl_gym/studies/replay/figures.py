@@ -46,10 +46,7 @@ def track_figures(
         Result of `track_errors`; None: without figures of errors.
     """
     result: dict[str, Any] = {
-        "settings": {
-            **settings.flat(),
-            "range_std_m": range_std_of(recording, settings),
-        },
+        "settings": {**settings.flat(), "range_std_m": range_std_of(recording, settings)},
         "epochs": len(track.times),
         "duration_s": float(track.times[-1] - track.times[0]),
         "links": int(recording.links.sum()),

@@ -52,9 +52,7 @@ def clocked(recording: Recording, settings: Settings) -> InertialLog | None:
 
 
 def standing(
-    recording: Recording,
-    settings: Settings,
-    prior: tuple[FloatArray, FloatArray, FloatArray],
+    recording: Recording, settings: Settings, prior: tuple[FloatArray, FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a prior with roll and pitch from gravity; its yaw and yaw variance are unchanged."""
     log = clocked(recording, settings)

@@ -12,11 +12,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.settings import Settings
 
-__all__ = [
-    "height_offset",
-    "origin_of",
-    "volume_of",
-]
+__all__ = ["height_offset", "origin_of", "volume_of"]
 
 # Coordinates above this value are map coordinates.
 _MAP_M = 1e4

@@ -54,10 +54,7 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
     """Yield the faults that can be tested without previous results."""
     recording, settings = trial
     yield from _of_settings(trial)
-    for kind, ids, axis in (
-        ("anchors", recording.anchor_ids, 1),
-        ("tags", recording.tag_ids, 2),
-    ):
+    for kind, ids, axis in (("anchors", recording.anchor_ids, 1), ("tags", recording.tag_ids, 2)):
         for i, j in itertools.combinations(_most_active(recording, axis), 2):
             text = f"{kind} {ids[i]} and {ids[j]} look swapped"
             changed = _with(trial, _swapped(recording, i, j, axis))

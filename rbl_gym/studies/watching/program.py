@@ -18,23 +18,11 @@ from rbl_gym.recordings import Recording
 from rbl_gym.studies.replay import Settings, Track
 from rbl_gym.studies.watching.frames import Frame, filter_named
 from rbl_gym.studies.watching.live import Disturbances, Stage, frames, stage_of_scene
-from rbl_gym.studies.watching.played import (
-    Act,
-    env_frames,
-    own_filter,
-    places_anchors,
-    world_of,
-)
+from rbl_gym.studies.watching.played import Act, env_frames, own_filter, places_anchors, world_of
 from rbl_gym.studies.watching.recorded import recorded_frames, track_all
 from rbl_gym.worlds.scene import Scene
 
-__all__ = [
-    "Program",
-    "env_program",
-    "live_program",
-    "program_of",
-    "recorded_program",
-]
+__all__ = ["Program", "env_program", "live_program", "program_of", "recorded_program"]
 
 # Margin around the anchors and the track of a recording, metres.
 _MARGIN_M = 0.5
