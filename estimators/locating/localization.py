@@ -65,7 +65,9 @@ class PoseEstimate(NamedTuple):
         unique.
     alternatives
         Other poses that fit the ranges about as well (within 3 sigma of the cost), such as mirror
-        poses. ``ml`` and ``robust`` search for them if the geometry is poor.
+        poses. ``ml`` and ``robust`` search for them if the geometry is poor. The search can miss
+        the mirror pose of a body near the plane of its anchors; `geometry.mirror.mirror_pose`
+        computes it.
     matrix
         (..., 3, 3), the raw matrix of ``ls``; for all other methods the rotation.
     iterations
