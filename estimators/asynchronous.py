@@ -62,12 +62,12 @@ class Stream(NamedTuple):
     ----------
     checkpoints
         In order of time: the last one before the window, and all inside it.
-    refused
+    dropped
         Number of ranges left out because they came too late for the window.
     """
 
     checkpoints: tuple[Checkpoint, ...]
-    refused: int
+    dropped: int
 
     @property
     def time(self) -> float:
@@ -134,7 +134,7 @@ class Asynchronous:
         """Return the stream with one more range, metres, (...) for bodies with the same times.
 
         A range before the start, or before the newest by more than the window, is left out and
-        counted in `refused`.
+        counted in `dropped`.
 
         Parameters
         ----------
@@ -176,7 +176,7 @@ class Asynchronous:
         measured = TimedRange(time, anchor, tag, value, twist, noise, anchors)
         newest = max(time, stream.time)
         if time < stream.checkpoints[0].time or time < newest - self.window_s:
-            return stream._replace(refused=stream.refused + 1)
+            return stream._replace(dropped=stream.dropped + 1)
         kept = [point for point in stream.checkpoints if point.time <= time]
         later = [point.measured for point in stream.checkpoints[len(kept) :]]
         for each in (measured, *later):
@@ -185,7 +185,7 @@ class Asynchronous:
         first = max(
             k for k, point in enumerate(kept) if k == 0 or point.time < newest - self.window_s
         )
-        return Stream(tuple(kept[first:]), stream.refused)
+        return Stream(tuple(kept[first:]), stream.dropped)
 
     def _advanced(self, point: Checkpoint, measured: TimedRange) -> Checkpoint:
         state = self._moved(point, measured.time, measured.twist)

@@ -34,7 +34,7 @@ GATE = 4.0
 # Without it, the most likely standard deviation would be one that rejects everything.
 OUTLIER_SHARE, OUTLIER_DENSITY = 0.05, 0.1
 LOG_USED = np.log((1 - OUTLIER_SHARE) / np.sqrt(2 * np.pi))
-LOG_REFUSED = np.log(OUTLIER_SHARE * OUTLIER_DENSITY)
+LOG_REJECTED = np.log(OUTLIER_SHARE * OUTLIER_DENSITY)
 
 
 class Innovations(NamedTuple):
@@ -144,7 +144,7 @@ def innovations(
         nis = nis - (found * (total @ found)).sum(axis=(-2, -1))
         log_det = log_det + np.linalg.slogdet(total)[1]
         dof = dof - (~empty).sum(axis=-1)
-    likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REFUSED
+    likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REJECTED
     if hasattr(after, "log_evidence") and after.log_weights.shape[-1] > 1:
         likelihood = after.log_evidence - before.log_evidence
     std = np.sqrt(variance * (1 + own))

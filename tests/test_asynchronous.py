@@ -50,7 +50,7 @@ def test_ranges_out_of_order_give_what_the_ordered_ones_give_to_the_last_bit(nam
     assert late[9][0] > late[8][0] - links.window_s
     for row in late:
         got = links.add(got, *row, twist=twist)
-    assert got.refused == 0
+    assert got.dropped == 0
     assert got.time == want.time == rows[-1][0]
     same(links.belief(got), links.belief(want))
     same(links.belief(got, got.time + 0.3, twist), links.belief(want, got.time + 0.3, twist))
@@ -64,13 +64,13 @@ def test_one_that_is_too_late_is_left_out_and_counted():
         stream = links.add(stream, *row)
     assert stream.time - first[0] > links.window_s
     after = links.add(stream, *first)
-    assert (after.refused, after.checkpoints) == (1, stream.checkpoints)
-    assert links.add(after, -1.0, *first[1:]).refused == 2
+    assert (after.dropped, after.checkpoints) == (1, stream.checkpoints)
+    assert links.add(after, -1.0, *first[1:]).dropped == 2
     # The memory is that of the window: nothing but its last state is kept of what lies before.
     ages = [stream.time - point.time for point in stream.checkpoints]
     assert ages[0] > links.window_s >= ages[1]
     edge = (stream.time - links.window_s, *first[1:])
-    assert links.add(stream, *edge).refused == 0
+    assert links.add(stream, *edge).dropped == 0
 
 
 def test_ranges_of_one_moment_are_an_epoch():

@@ -113,7 +113,7 @@ def test_the_fault_put_in_is_named(fault):
     assert 0.7 < cause["nis_per_dof"] < 1.6
     assert WORDS.get(fault, "") in cause["text"]
     # Ranges far too long for the room may fit a mirror pose as well.
-    whole = found["nis_per_dof"] > 1.5 or found["refused_share"] > 0.2
+    whole = found["nis_per_dof"] > 1.5 or found["rejected_share"] > 0.2
     subject = "the filter does not fit its data" if whole else "a part of the ranges does not fit"
     assert notes[-1].startswith(f"WARNING: {subject}")
     assert cause["text"] in notes[-1]
@@ -208,7 +208,7 @@ def test_residuals_by_anchor_tag_and_link():
     assert first["mean_m"] == pytest.approx(here[found.used[40:, 0, 0]].mean())
     assert first["spread_m"] == pytest.approx(0.1, rel=0.4)
     late = next(row for row in tables["links"] if (row["anchor"], row["tag"]) == ("A3", "T1"))
-    assert late["refused_share"] == 1.0
+    assert late["rejected_share"] == 1.0
     assert late["mean_m"] is None
     assert sum(row["ranges"] for row in tables["links"]) == lost.sum()
     when, ratio, low, high = replay.nis_curve(log.times, found, points=10)

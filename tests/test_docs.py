@@ -113,7 +113,7 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
             train_a_little(block, str(page.name), names)
     if page.stem == "unknown_motion":
         assert capsys.readouterr().out.startswith("(6,) (12, 12)\n")
-        assert names["stream"].refused == 0
+        assert names["stream"].dropped == 0
         assert np.isfinite(names["links"].belief(names["stream"]).translation).all()
 
 

@@ -124,7 +124,7 @@ def test_a_filter_of_the_old_interface_is_refused_by_name_where_it_matters():
         replay.track_recording(log(0.02), replay.Settings.of(filter=OLD))
     stage = stages.scene_stage({"name": "hall", "steps": 2}, "nominal", 2, 0)
     record, _ = stages.run_filter(stage, OLD, {})
-    assert record["status"] == "refused"
+    assert record["status"] == "ValueError"
     assert "OldInterface' must take update(" in record["message"]
     # Elsewhere it runs as ever.
     env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="uwb_room"), OLD)

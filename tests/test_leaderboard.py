@@ -286,7 +286,7 @@ def test_a_filter_that_cannot_observe_is_a_row_with_its_rank(tmp_path, capsys):
     sea, vague = found["sea", "kf", "nominal"], found["vague", "kf", "nominal"]
     assert (sea["status"], sea["rank"], sea["states"]) == ("unobservable", 8, 12)
     assert sea["tags_m"]["rmse"] > 0
-    assert (vague["status"], vague["rank"]) == ("refused", 8)
+    assert (vague["status"], vague["rank"]) == ("ValueError", 8)
     assert vague["message"].startswith("at epoch 0: anchors and tags determine only rank 8")
     assert found["sea", "iekf", "nominal"]["status"] == "ok"
     assert (found["sea", "iekf", "nominal"]["rank"], found["sea", "iekf", "nominal"]["states"]) == (
@@ -295,7 +295,7 @@ def test_a_filter_that_cannot_observe_is_a_row_with_its_rank(tmp_path, capsys):
     )
     table = capsys.readouterr().out
     assert "kf: does not determine the pose in this scene (rank 8 of 12)" in table
-    assert "kf, lost-links: refused at epoch 0" in table
+    assert "kf, lost-links: ValueError at epoch 0" in table
 
 
 def test_a_filter_that_fails_is_a_row_and_a_status(tmp_path, short, capsys):
@@ -313,7 +313,10 @@ def test_a_filter_that_takes_no_such_law_and_one_without_a_pose_are_rows(tmp_pat
                          "--filters", "tests.fragile:refuses_the_paper")  # fmt: skip
     assert status == 1
     paper, room = rows(data)
-    assert (paper["status"], paper["message"]) == ("refused", "at epoch 0: noise must have a floor")
+    assert (paper["status"], paper["message"]) == (
+        "ValueError",
+        "at epoch 0: noise must have a floor",
+    )
     assert room["status"] == "failed"
     assert "TypeError: beliefs must have arrays" in room["message"]
     assert "got [(6, 3, 3), (6, 3), (6, 3, 3)]" in room["message"]

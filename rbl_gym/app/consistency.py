@@ -27,7 +27,7 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
         return
     console.print(
         f"NIS per degree of freedom {found['nis_per_dof']:.2f} (1: consistent), log-likelihood "
-        f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % rejected"
+        f"{found['log_likelihood']:.2f} per range, {100 * found['rejected_share']:.1f} % rejected"
     )
     table = new_table("residuals after the update", [""], _HEADINGS)
     for kind in ("anchor", "tag"):
@@ -49,12 +49,12 @@ def tuned_text(found: dict[str, Any]) -> str:
 
 
 def _size(row: dict[str, Any]) -> float:
-    return row["refused_share"] + abs(row["mean_m"] or 0.0) + row["spread_m"]
+    return row["rejected_share"] + abs(row["mean_m"] or 0.0) + row["spread_m"]
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
     mean = "-" if row["mean_m"] is None else f"{row['mean_m']:+.3f}"
-    return [str(row["ranges"]), mean, f"{row['spread_m']:.3f}", f"{100 * row['refused_share']:.1f}"]
+    return [str(row["ranges"]), mean, f"{row['spread_m']:.3f}", f"{100 * row['rejected_share']:.1f}"]
 
 
 def draw_nis(axes: Axes, replayed: Replayed) -> None:
@@ -99,7 +99,7 @@ def consistency_parts(replayed: Replayed) -> list[str]:
             "Normalised innovation squared (NIS) per degree of freedom "
             f"{found['nis_per_dof']:.2f} (1: consistent; far above: the filter assumes too little "
             f"noise or motion, or wrong positions), log-likelihood {found['log_likelihood']:.2f} "
-            f"per range, {100 * found['refused_share']:.1f} % of the ranges rejected. Residuals "
+            f"per range, {100 * found['rejected_share']:.1f} % of the ranges rejected. Residuals "
             "are those after the update: mean of the ranges used, spread of all (1.48 times the "
             "median distance from the median)."
         ),
@@ -116,7 +116,7 @@ def consistency_parts(replayed: Replayed) -> list[str]:
                 row["ranges"],
                 row["mean_m"],
                 row["spread_m"],
-                100 * row["refused_share"],
+                100 * row["rejected_share"],
             ]
             for row in residuals[kind]
         ]
@@ -151,7 +151,7 @@ def _charts(replayed: Replayed) -> Any:
     for row in rows:
         at = anchors.index(row["anchor"]), tags.index(row["tag"])
         mean[at] = np.nan if row["mean_m"] is None else row["mean_m"]
-        refused[at] = 100 * row["refused_share"]
+        refused[at] = 100 * row["rejected_share"]
     largest = max(float(np.nanmax(np.abs(mean), initial=0.0)), 0.01)
     layout: Any = shown.layout
     for column, values, scale, ends, axis in (

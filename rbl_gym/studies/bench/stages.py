@@ -118,9 +118,9 @@ def run_filter(
     """Run a filter on a stage; return its record, and its microseconds per step and trial.
 
     `status` is ``"ok"``; ``"unobservable"`` if the geometry does not determine the states (the
-    filter then relies on its prior); ``"refused"`` if the filter raised a ValueError; ``"failed"``
-    if it raised another error. For the last two, `message` gives the epoch and the error, and there
-    is no time.
+    filter then relies on its prior); ``"ValueError"`` if the filter raised one; ``"failed"`` if it
+    raised another error. For the last two, `message` gives the epoch and the error, and there is no
+    time.
     """
     result: dict[str, Any] = {"status": "ok", "message": None}
     result["rank"], result["states"] = stage.pose_rank, 6
@@ -165,11 +165,11 @@ def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
 
 
 def _stopped(stop: StoppedError) -> dict[str, Any]:
-    """Return the status: ``"refused"`` for a ValueError, ``"failed"`` for any other error."""
-    refused = isinstance(stop.error, ValueError)
-    kind = "" if refused else f"{type(stop.error).__name__}: "
+    """Return the status: ``"ValueError"`` for a ValueError, ``"failed"`` for any other error."""
+    wrong = isinstance(stop.error, ValueError)
+    kind = "" if wrong else f"{type(stop.error).__name__}: "
     return {
-        "status": "refused" if refused else "failed",
+        "status": "ValueError" if wrong else "failed",
         "message": f"at epoch {stop.epoch}: {kind}{stop.error}",
     }
 

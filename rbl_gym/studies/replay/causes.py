@@ -15,7 +15,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import Innovations
-from rbl_gym.estimators.innovation import LOG_REFUSED, LOG_USED
+from rbl_gym.estimators.innovation import LOG_REJECTED, LOG_USED
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.evidence import Evidence, Trial, evidence, std_of
@@ -117,7 +117,7 @@ def _excess(trial: Trial, seen: Evidence) -> float:
     links = trial.recording.links
     usual = LOG_USED - 0.5 - np.log(std_of(*trial)[links]).mean()
     nis, dof = seen.nis.sum(), seen.dof.sum()
-    return float(0.5 * (nis - dof) + (links.sum() - dof) * (usual - LOG_REFUSED))
+    return float(0.5 * (nis - dof) + (links.sum() - dof) * (usual - LOG_REJECTED))
 
 
 def _strained_part(recording: Recording, found: Innovations) -> slice:
@@ -126,7 +126,7 @@ def _strained_part(recording: Recording, found: Innovations) -> slice:
     size = int(np.clip(_RANGES / max(links.mean(), 1), _FEWEST, _MOST))
     if size >= len(links):
         return slice(0, len(links))
-    refused = -LOG_REFUSED * (links - found.dof)
+    refused = -LOG_REJECTED * (links - found.dof)
     strain = np.concatenate([[0.0], np.cumsum(0.5 * (found.nis - found.dof) + refused)])
     first = int(np.argmax(strain[size:] - strain[:-size]))
     return slice(first, first + size)

@@ -17,7 +17,7 @@ __all__ = ["contradicts", "nis_curve", "residual_tables"]
 # The data contradict a filter if the NIS of a log, or of a part of this size, exceeds a multiple of
 # its expectation, or if more than a share of the ranges is rejected; and if the probability of this
 # by chance is below a limit.
-MOST_NIS, MOST_REFUSED, _PART = 1.5, 0.2, 0.1
+MOST_NIS, MOST_REJECTED, _PART = 1.5, 0.2, 0.1
 _CHANCE = 1e-6
 _BLOCKS = 20
 # The data also contradict it in two other cases, each with at least `_FEWEST` ranges. First, the
@@ -40,13 +40,13 @@ def consistency_figures(found: Innovations, recording: Recording) -> dict[str, A
     Returns
     -------
     ``nis_per_dof`` (1 if the filter is consistent), ``log_likelihood`` (per range),
-    ``refused_share``, ``contradicts``, and the tables of `residual_tables`.
+    ``rejected_share``, ``contradicts``, and the tables of `residual_tables`.
     """
     ranges, used = int(recording.links.sum()), int(found.dof.sum())
     return {
         "nis_per_dof": float(found.nis.sum() / max(used, 1)),
         "log_likelihood": float(found.log_likelihood.sum() / ranges),
-        "refused_share": 1 - used / ranges,
+        "rejected_share": 1 - used / ranges,
         "contradicts": contradicts(found, recording),
         "residuals": residual_tables(found, recording),
     }
@@ -78,7 +78,7 @@ def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatA
 
 
 def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> BoolArray:
-    lost = refused > MOST_REFUSED * (dof + refused)
+    lost = refused > MOST_REJECTED * (dof + refused)
     # A single wrong range among five is not reported.
     high = nis > MOST_NIS * dof
     if high.any():
@@ -90,7 +90,7 @@ def residual_tables(found: Innovations, recording: Recording) -> dict[str, list[
     """Return tables of residuals after the update, by anchor, by tag and by link.
 
     A row has the ids, ``ranges`` (their number), ``mean_m`` over the used ranges, ``spread_m`` over
-    all ranges, and ``refused_share``. The spread is 1.4826 times the median distance from the
+    all ranges, and ``rejected_share``. The spread is 1.4826 times the median distance from the
     median, which is the standard deviation of a Gaussian. Points and links without ranges have no
     row.
     """
@@ -121,7 +121,7 @@ def _row(found: Innovations, links: Any, index: tuple[Any, ...]) -> dict[str, An
         "ranges": count,
         "mean_m": float(residual[used].mean()) if used.any() else None,
         "spread_m": float(1.4826 * np.median(np.abs(residual - middle))),
-        "refused_share": float(1 - used.mean()),
+        "rejected_share": float(1 - used.mean()),
     }
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.causes import Cause, likely_causes
-from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REFUSED, consistency_figures
+from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REJECTED, consistency_figures
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track
 
@@ -48,10 +48,10 @@ def diagnose(
 
 
 def _subject(figures: dict[str, Any]) -> str:
-    ratio, refused = figures["nis_per_dof"], figures["refused_share"]
+    ratio, refused = figures["nis_per_dof"], figures["rejected_share"]
     # With one bad link among many, neither NIS nor the rejected share is large.
     subject = "the filter does not fit its data"
-    if ratio < MOST_NIS and refused < MOST_REFUSED:
+    if ratio < MOST_NIS and refused < MOST_REJECTED:
         subject = "a part of the ranges does not fit the filter"
     return (
         f"WARNING: {subject}: NIS per degree of freedom {ratio:.2f} (1: consistent), "
