@@ -212,6 +212,7 @@ def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_p
         return bad._replace(biases=(*bad.biases[:-1], np.full(3, 1e3))), figures
 
     monkeypatch.setattr(training, "train", pretend)
+    monkeypatch.setattr(training, "require", lambda *_: None)
     command = ["train", "auv_buoys", "--steps", "1", "--out", str(tmp_path / "p.npz")]
     assert main([*command, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["held_out"]
@@ -393,7 +394,7 @@ def test_errors_are_one_line(tmp_path, capsys):
         (["evaluate", "auv_buoys", "--policy", str(good)], "policy 'mine' does not fit"),
         (
             ["evaluate", "selection", "--policy", str(good), "--policy", str(same)],
-            "two files are named 'mine'",
+            "two policies are named 'mine'",
         ),
         (["evaluate", "selection", "--policy", str(broken)], "is not a policy of rbl-gym"),
         (["evaluate", "selection", "--policy", str(tmp_path / "no.npz")], "No such file"),

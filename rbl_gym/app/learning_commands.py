@@ -8,8 +8,8 @@ from typing import Any
 
 from rbl_gym.app.terminal import add_json, add_seed, positive, progress, write_json
 from rbl_gym.checks import check_one_of
-from rbl_gym.studies.extras import MissingExtraError, require
-from rbl_gym.studies.learning.policies import AnyPolicy
+from rbl_gym.studies.extras import require
+from rbl_gym.studies.learning.own_policies import OwnPolicy, PolicyLike, policy_like
 from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
 from rbl_gym.studies.learning.training import ALGORITHMS
 from rbl_gym.worlds.scene_source import read_scene, read_scenes
@@ -114,7 +114,7 @@ def _title(options: argparse.Namespace, trained: bool = False) -> str:
     return f"{options.task} in {worlds}" if worlds else options.task
 
 
-def _played(options: argparse.Namespace) -> tuple[RlTask, str, dict[str, AnyPolicy]]:
+def _played(options: argparse.Namespace) -> tuple[RlTask, str, dict[str, PolicyLike]]:
     """Return task, title and policies; the worlds are the requested or those of the policies."""
     from rbl_gym.studies.learning.trained_worlds import common_worlds
 
@@ -133,8 +133,9 @@ def _add_players(
         "--policy",
         action="append",
         default=[],
-        metavar="F",
-        help="file of a policy, from rbl-gym train; may be given several times",
+        metavar="F|MODULE:FUNCTION",
+        help="file of a policy, from rbl-gym train, or a function of your own: observations of all "
+        "worlds in, actions out; may be given several times",
     )
     parser.add_argument(
         "--references",
@@ -158,16 +159,9 @@ def _train(options: argparse.Namespace) -> int:
     task = rl_task(options.task).in_worlds(**worlds)
     steps = options.steps or task.steps
     path = Path(options.out or f"out/{options.task}-{options.seed}.npz")
-    algorithm = options.algorithm or task.algorithm
-    try:
-        with progress(f"{algorithm} on {_title(options)}", steps) as advance:
-            policy, result = training.train(
-                options.task, task, steps, options.seed, advance, algorithm
-            )
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"training needs the extra rl ({error.name} is missing): pip install 'rbl-gym[rl]'"
-        ) from error
+    algorithm = training.check_training(task, options.seed, options.algorithm)
+    with progress(f"{algorithm} on {_title(options)}", steps) as advance:
+        policy, result = training.train(options.task, task, steps, options.seed, advance, algorithm)
     policy.meta["command"] = _command(options, steps, algorithm)
     policy.meta.update(trained_worlds.worlds_to_keep(worlds))
     policies.save(policy, path)
@@ -241,14 +235,13 @@ def _require_searches(names: set[str]) -> None:
         require("cmaes", "placement")
 
 
-def _policies(paths: list[str]) -> dict[str, AnyPolicy]:
-    """Return policies by file name; raises ValueError if two have the same name."""
-    from rbl_gym.studies.learning import policies
-
-    loaded: dict[str, AnyPolicy] = {}
+def _policies(paths: list[str]) -> dict[str, PolicyLike]:
+    """Return policies by name of file or function; raises ValueError if two have the same name."""
+    loaded: dict[str, PolicyLike] = {}
     for path in paths:
-        label = Path(path).stem
+        policy = policy_like(path)
+        label = path.rpartition(":")[2] if isinstance(policy, OwnPolicy) else Path(path).stem
         if label in loaded:
-            raise ValueError(f"--policy: two files are named {label!r}: rename {path}")
-        loaded[label] = policies.load(path)
+            raise ValueError(f"--policy: two policies are named {label!r}: rename {path}")
+        loaded[label] = policy
     return loaded

@@ -10,7 +10,7 @@ searches.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +20,9 @@ from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import layouts, search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.learning import rollouts
-from rbl_gym.studies.learning.policies import AnyPolicy, check_fit
-from rbl_gym.studies.learning.rl_tasks import RlTask
+from rbl_gym.studies.learning.own_policies import PolicyLike, policies_by_label
+from rbl_gym.studies.learning.policies import check_fit
+from rbl_gym.studies.learning.rl_tasks import RlTask, task_of
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.wrappers import controllers
 
@@ -63,11 +64,11 @@ def controllers_of(task: RlTask) -> dict[str, controllers.Controller]:
 
 
 def evaluate(
-    task: RlTask,
-    policies: dict[str, AnyPolicy],
-    names: list[str],
-    worlds: int,
-    seed: int,
+    task: Any,
+    policies: Any = None,
+    names: Sequence[str] | None = None,
+    worlds: int = 256,
+    seed: int = 0,
     advance: Advance = silent,
 ) -> dict[str, Any]:
     """Return losses of policies and references on the same `worlds` held-out worlds.
@@ -75,25 +76,43 @@ def evaluate(
     Parameters
     ----------
     task
-        The task.
+        A task, its name (`rl_tasks.TASKS`), or an environment of `gym.make` or `gym.make_vec` with
+        one of the ids of these tasks. Its arguments are used, itself is not changed.
     policies
-        Policies by label. A placement task also refines each by a few gradient steps, as ``LABEL +
-        gradient``.
+        One policy or a dict by label: anything that `own_policies.policy_like` takes, for example a
+        function ``observation -> actions``, where both are arrays of all worlds. A placement task
+        also refines each by a few gradient steps, as ``LABEL + gradient``.
     names
-        Names of `references`; ``random`` and the strongest are always included. If there are
-        several strongest, ``best-known`` is the best of them in each world.
+        Names of `references`; None: all. ``random`` and the strongest are always included. If there
+        are several strongest, ``best-known`` is the best of them in each world.
     worlds, seed
         Number and seed of the worlds.
     advance
         Called after each reference and policy.
 
+    Returns
+    -------
+    A dict. ``methods[LABEL]`` has ``loss`` and ``loss_std_error``, ``score_m`` (None if the loss is
+    not a mean of log b), ``normalised``, ``normalised_low`` and ``normalised_high``.
+
     Raises
     ------
     ValueError
         If a reference is unknown, or a policy does not fit the task.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rbl_gym.studies.learning.evaluation import evaluate
+    >>> result = evaluate(
+    ...     "selection", lambda seen: np.ones((len(seen), 12)), names=["nearest"], worlds=2
+    ... )
+    >>> list(result["methods"])
+    ['random', 'nearest', 'greedy-with-map', 'policy']
     """
+    task, policies = task_of(task), policies_by_label(policies)
     known = references(task)
-    names = [check_one_of("reference", name, known) for name in names]
+    names = [check_one_of("reference", name, known) for name in (known if names is None else names)]
     best_of = strongest(task)
     names = [name for name in known if name in {*names, known[0], *best_of}]
     play = _placement_losses if task.env_id == "RBL/AnchorPlacement-v0" else _loop_losses
@@ -109,9 +128,7 @@ def evaluate(
         for name, loss in losses.items()
     }
     for figures in methods.values():
-        # With a price, a loss is not the logarithm of metres.
-        priced = task.arguments.get("mode") == "priced"
-        figures["score_m"] = None if priced else math.exp(figures["loss"])
+        figures["score_m"] = math.exp(figures["loss"]) if _is_log_score(task) else None
     return {
         "worlds": worlds,
         "seed": seed,
@@ -121,7 +138,14 @@ def evaluate(
     }
 
 
-def held_out_returns(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) -> dict[str, Any]:
+def _is_log_score(task: RlTask) -> bool:
+    """Return whether losses are means of log b. With a price or another reward they are not."""
+    own = task.arguments.get("reward", "belief") != "belief"
+    placed = task.env_id == "RBL/AnchorPlacement-v0"
+    return placed or not (own or task.arguments.get("mode") == "priced")
+
+
+def held_out_returns(task: RlTask, policy: PolicyLike, worlds: int, seed: int) -> dict[str, Any]:
     """Return sums of rewards of a saved policy and of random actions, in the worlds of `evaluate`.
 
     The returns of a training differ: its actions are random around the policy's, in other worlds.
@@ -163,36 +187,38 @@ def _figures(
     }
 
 
-def _check_policies(task: RlTask, policies: dict[str, AnyPolicy]) -> None:
+def _check_policies(task: RlTask, policies: dict[str, PolicyLike]) -> None:
     """Raise ValueError for unfit policies or equal labels, before the slow references."""
     envs = task.make(1)
     for label, policy in policies.items():
         if label in {*references(task), BEST_KNOWN}:
-            raise ValueError(f"policy {label!r} has the name of a reference: rename its file")
+            raise ValueError(f"policy {label!r} has the name of a reference: rename it")
         check_fit(policy, label, envs)
 
 
 def _of_all(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     seed: int,
     advance: Advance,
     of_reference: Callable[[str, np.random.Generator], Any],
-    of_policy: Callable[[AnyPolicy], Any],
+    of_policy: Callable[[PolicyLike], Any],
 ) -> dict[str, Any]:
     """Run one function on references, each with its own generator, and another on policies."""
     _check_policies(task, policies)
     advance(0, more=len(names) + len(policies))
+    # Policies first: if one fails, it does so before the slow references.
+    played = {}
+    for label, policy in policies.items():
+        played[label] = of_policy(policy)
+        advance()
     found = {}
     for name in names:
         rng = np.random.default_rng([seed, references(task).index(name)])
         found[name] = of_reference(name, rng)
         advance()
-    for label, policy in policies.items():
-        found[label] = of_policy(policy)
-        advance()
-    return found
+    return found | played
 
 
 # # --- step-by-step tasks -----------------------------------------------------------------------
@@ -200,7 +226,7 @@ def _of_all(
 
 def _loop_losses(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     seed: int,
@@ -210,7 +236,7 @@ def _loop_losses(
         controller = controllers_of(task)[name]
         return _rollout(task, lambda env, _: controller(env, rng), worlds, seed)
 
-    def policy(played: AnyPolicy) -> FloatArray:
+    def policy(played: PolicyLike) -> FloatArray:
         return _rollout(task, played.player(), worlds, seed)
 
     return _of_all(task, policies, names, seed, advance, reference, policy)
@@ -229,7 +255,7 @@ def _rollout(
 
 def _placement_losses(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     seed: int,
@@ -271,7 +297,7 @@ class Layouts(NamedTuple):
 
 def layouts_of(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     seed: int,
@@ -342,7 +368,7 @@ def _reference_layout(
 
 def _policy_layouts(
     task: RlTask,
-    policy: AnyPolicy,
+    policy: PolicyLike,
     worlds: int,
     seed: int,
     problems: list[tuple[PlacementTask, Context]],

@@ -272,8 +272,13 @@ def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
     return kind, int(np.prod(space.shape or ()))
 
 
-def check_fit(policy: AnyPolicy, label: str, envs: Any) -> None:
-    """Raise ValueError unless a policy fits the spaces of an environment, vector or scalar."""
+def check_fit(policy: Any, label: str, envs: Any) -> None:
+    """Raise ValueError unless a policy fits the spaces of an environment, vector or scalar.
+
+    The spaces of an `OwnPolicy` are not known. Its actions are checked when it is played.
+    """
+    if not isinstance(policy, AnyPolicy):
+        return
     trained = f"policy {label!r} does not fit: it was trained on {policy.meta.get('task')!r}"
     if isinstance(policy, SetPolicy):
         wanted = SET_KINDS[policy.kind][0]

@@ -11,7 +11,7 @@ import gymnasium as gym
 from rbl_gym.checks import check_one_of
 from rbl_gym.worlds.families import SceneFamily, family
 
-__all__ = ["TASKS", "RlTask", "rl_task"]
+__all__ = ["TASKS", "RlTask", "rl_task", "task_of"]
 
 # Worlds of a training or evaluation have the seeds from SEED_STRIDE times its own seed on. Seeds of
 # evaluations lie beyond those of all trainings.
@@ -153,3 +153,49 @@ TASKS: dict[str, RlTask] = {
 def rl_task(name: str) -> RlTask:
     """Return the named task, or raise ValueError."""
     return TASKS[check_one_of("task", name, list(TASKS))]
+
+
+# Environments with references, and arguments of `gym.make_vec` that are not those of a world.
+_REFERRED = ("RBL/AnchorPlacement-v0", "RBL/MobileAnchors-v0", "RBL/AnchorSelection-v0")
+_OF_FORM = (
+    "num_envs", "vectorization_mode", "autoreset_mode", "max_episode_steps", "render_mode",
+)  # fmt: skip
+
+
+def task_of(given: Any) -> RlTask:
+    """Return a task.
+
+    Parameters
+    ----------
+    given
+        A task; its name in `TASKS`; or an environment of `gym.make` or `gym.make_vec`, without
+        wrappers. The task has its id and its arguments.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these, or there are no references for the environment.
+    """
+    if isinstance(given, RlTask):
+        return given
+    if isinstance(given, str):
+        return rl_task(given)
+    spec = getattr(given, "spec", None)
+    if spec is None:
+        raise ValueError(
+            f"task must be one of {', '.join(TASKS)}, or an environment of gym.make or "
+            f"gym.make_vec, got {given!r:.80}"
+        )
+    if spec.id not in _REFERRED:
+        raise ValueError(
+            f"task must be an environment with references, {', '.join(_REFERRED)}, got {spec.id}. "
+            "For others compare mean rewards (docs/your_own_task.md)"
+        )
+    if spec.additional_wrappers:
+        names = ", ".join(one.name for one in spec.additional_wrappers)
+        raise ValueError(
+            f"task must be an environment without wrappers, got {names}. Give env.unwrapped, and "
+            "do in the policy what the wrappers do"
+        )
+    kept = {key: value for key, value in spec.kwargs.items() if key not in _OF_FORM}
+    return RlTask(spec.id, kept, steps=1, rollout=1)

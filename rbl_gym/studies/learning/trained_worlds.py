@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.studies.learning.policies import AnyPolicy
+from rbl_gym.studies.learning.own_policies import PolicyLike
 
 __all__ = ["common_worlds", "worlds_to_keep"]
 
@@ -32,7 +32,7 @@ def worlds_to_keep(worlds: Mapping[str, Any]) -> dict[str, Any]:
     return {**worlds, **({"files": files} if files else {})}
 
 
-def common_worlds(task: str, policies: Mapping[str, AnyPolicy]) -> dict[str, Any]:
+def common_worlds(task: str, policies: Mapping[str, PolicyLike]) -> dict[str, Any]:
     """Return the worlds in which policies were trained, as arguments of `RlTask.in_worlds`.
 
     Parameters

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import check_one_of
+from rbl_gym.studies.extras import require
 from rbl_gym.studies.learning.policies import AnyPolicy, Policy, kind_and_outputs
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 from rbl_gym.studies.learning.sb3_models import policy_of
 from rbl_gym.studies.learning.set_policies import SetPolicy
 
-__all__ = ["ALGORITHMS", "train"]
+__all__ = ["ALGORITHMS", "check_training", "train"]
 
 # The algorithms, and the kinds of policies that they train.
 ALGORITHMS = {
@@ -61,11 +62,49 @@ def train(
 
     Raises
     ------
+    ValueError, MissingExtraError
+        As `check_training`.
+    """
+    algorithm = check_training(task, seed, algorithm)
+    import torch  # pyright: ignore[reportMissingImports]
+
+    # One thread: small networks gain nothing from more, and the sums would vary.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    learn = _taught if algorithm in _TAUGHT else _explored
+    begin, cpu = time.perf_counter(), time.process_time()
+    told = 0
+
+    def tell(more: int) -> None:
+        # Whole rollouts may end after the number of steps, or before it.
+        nonlocal told
+        more = min(more, steps - told)
+        told += more
+        advance(more)
+
+    try:
+        make, figures = learn(algorithm, task, steps, seed, tell)
+    finally:
+        torch.set_num_threads(threads)
+    tell(steps)
+    meta = {"task": name, "seed": seed, "steps": steps, "algorithm": algorithm}
+    seconds = {
+        "seconds": time.perf_counter() - begin,
+        "cpu_seconds": time.process_time() - cpu,
+    }
+    return make(meta), {**meta, **seconds, **figures}
+
+
+def check_training(task: RlTask, seed: int, algorithm: str | None = None) -> str:
+    """Return the algorithm of a training, if it can begin.
+
+    Raises
+    ------
     ValueError
         If the worlds of the seed are held out for evaluations, or the algorithm cannot learn the
         task.
-    ModuleNotFoundError
-        If stable-baselines3 or sb3-contrib is missing (extra ``rl``).
+    MissingExtraError
+        If torch, stable-baselines3 or sb3-contrib is missing (extra ``rl``).
     """
     if seed * SEED_STRIDE >= HELD_OUT_SEED:
         raise ValueError(
@@ -74,20 +113,12 @@ def train(
         )
     algorithm = check_one_of("algorithm", algorithm or task.algorithm, list(ALGORITHMS))
     _check_goes_with(algorithm, task)
-    import torch  # pyright: ignore[reportMissingImports]
-
-    # One thread: small networks gain nothing from more, and the sums would vary.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    learn = _taught if algorithm in _TAUGHT else _explored
-    begin, cpu = time.perf_counter(), time.process_time()
-    try:
-        make, figures = learn(algorithm, task, steps, seed, advance)
-    finally:
-        torch.set_num_threads(threads)
-    meta = {"task": name, "seed": seed, "steps": steps, "algorithm": algorithm}
-    seconds = {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
-    return make(meta), {**meta, **seconds, **figures}
+    libraries = ["torch"]
+    if algorithm not in _TAUGHT:
+        libraries += ["stable_baselines3"] if algorithm == "ppo" else ["sb3_contrib"]
+    for library in libraries:
+        require(library, "rl")
+    return algorithm
 
 
 def _check_goes_with(algorithm: str, task: RlTask) -> None:

@@ -26,7 +26,8 @@ from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.learning import evaluation, rollouts
 from rbl_gym.studies.learning.evaluation import Layouts
-from rbl_gym.studies.learning.policies import AnyPolicy, check_fit
+from rbl_gym.studies.learning.own_policies import PolicyLike
+from rbl_gym.studies.learning.policies import check_fit
 from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds.scene import Scene
@@ -79,7 +80,7 @@ def tracking_filters(task: RlTask) -> list[str]:
 
 def transfer_task(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     repeats: int,
@@ -97,7 +98,7 @@ def transfer_task(
 
 def transfer_loops(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     seed: int,
@@ -201,7 +202,7 @@ class Bodies(NamedTuple):
 
 def transfer_layouts(
     task: RlTask,
-    policies: dict[str, AnyPolicy],
+    policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     repeats: int,
