@@ -147,6 +147,8 @@ def test_a_missing_library_is_named_before_a_training_begins(monkeypatch, capsys
         raise MissingExtraError(f"needs {module}, extra {extra}")
 
     monkeypatch.setattr(training, "require", missing)
+    with pytest.raises(MissingExtraError, match="needs torch"):
+        training.check_training(rl_task("halls"), 0)
     assert main(["train", "halls"]) == 2
     # No progress bar before it.
     assert capsys.readouterr().err == "rbl-gym: needs torch, extra rl\n"

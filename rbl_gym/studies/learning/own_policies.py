@@ -13,7 +13,7 @@ from rbl_gym.checks import imported
 from rbl_gym.studies.learning.policies import AnyPolicy, Policy, load
 from rbl_gym.studies.learning.set_policies import SetPolicy
 
-__all__ = ["OwnPolicy", "PolicyLike", "policies_by_label", "policy_like"]
+__all__ = ["OwnPolicy", "policies_by_label", "policy_like"]
 
 
 class OwnPolicy(NamedTuple):
