@@ -31,7 +31,8 @@ OF_MAKERS = {"anchor_placement": {"scenes", "reward"}}
 @pytest.mark.parametrize("page", PAGES)
 def test_options_and_their_defaults(page):
     text = (ROOT / "docs" / "environments" / f"{page}.md").read_text()
-    table = re.search(r"^\| (?:option|argument) \| default.*?\n(?=\n)", text, re.MULTILINE | re.DOTALL)
+    pattern = r"^\| (?:option|argument) \| default.*?\n(?=\n)"
+    table = re.search(pattern, text, re.MULTILINE | re.DOTALL)
     assert table is not None
     told = {}
     for row in table[0].splitlines()[2:]:
