@@ -54,7 +54,12 @@ def _size(row: dict[str, Any]) -> float:
 
 def _cells(row: dict[str, Any]) -> list[str]:
     mean = "-" if row["mean_m"] is None else f"{row['mean_m']:+.3f}"
-    return [str(row["ranges"]), mean, f"{row['spread_m']:.3f}", f"{100 * row['rejected_share']:.1f}"]
+    return [
+        str(row["ranges"]),
+        mean,
+        f"{row['spread_m']:.3f}",
+        f"{100 * row['rejected_share']:.1f}",
+    ]
 
 
 def draw_nis(axes: Axes, replayed: Replayed) -> None:
