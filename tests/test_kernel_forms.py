@@ -30,15 +30,18 @@ every_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 every_batch = pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
 
 
-def assert_equal_forms(form, *args, atol=1e-9) -> Any:
-    """Both forms of a function: relative to the largest entry, and for shapes that broadcast."""
+def assert_equal_forms(form, *args, atol=1e-9, least=1e-300) -> Any:
+    """Both forms of a function: relative to the largest entry, and for shapes that broadcast.
+
+    `least` is the smallest size of the entries that counts.
+    """
     with np.errstate(all="ignore"):
         got, want = form.kernel(*args), form.textbook(*args)
     got, want = (x if isinstance(x, tuple) else (x,) for x in (got, want))
     assert len(got) == len(want)
     for mine, plain in zip(got, want, strict=True):
         assert mine.shape == plain.shape
-        scale = np.nanmax(np.abs(plain), initial=1e-300)
+        scale = np.nanmax(np.abs(plain), initial=least)
         np.testing.assert_allclose(mine / scale, plain / scale, rtol=0, atol=atol)
     return got
 
@@ -428,7 +431,8 @@ def test_figures_of_beliefs(batch, angle, n):
     belief = rotations.exp(axis) @ world.rotation, world.translation + 0.1, world.matrix
     truth = world.rotation, world.translation, world.tags
     # The angle comes of a matrix near the identity, whose entries are rounded to 1e-16.
-    assert_equal_forms(metrics._judge, *belief, *truth, atol=max(1e-9, 1e-15 / max(angle, 1e-9)))
+    atol = max(1e-9, 1e-15 / max(angle, 1e-9))
+    assert_equal_forms(metrics._judge, *belief, *truth, atol=atol, least=1e-9)
     figures = metrics.judge(*belief, *truth)
     assert isinstance(figures, Figures)
     np.testing.assert_allclose(figures.rotation_error_rad, angle, atol=1e-7)
@@ -442,7 +446,7 @@ def test_figures_of_no_covariance_are_refused(factor):
     world = World((3,))
     world.matrix[1] *= factor
     pair = world.rotation, world.translation
-    assert_equal_forms(metrics._judge, *pair, world.matrix, *pair, world.tags)
+    assert_equal_forms(metrics._judge, *pair, world.matrix, *pair, world.tags, least=1e-6)
     with pytest.raises(ValueError, match="covariance positive definite"):
         metrics.judge(*pair, world.matrix, *pair, world.tags)
 

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from rbl_gym.kernels.epoch import tag_position
 from rbl_gym.kernels.jit import gufunc
 from rbl_gym.kernels.linear_algebra import of_size
 from rbl_gym.kernels.noise_laws import reference_of, weight
 from rbl_gym.kernels.offsets import derivative
+from rbl_gym.kernels.workspace import workspace
 
 cholesky3, solve_factored3, _ = of_size(3)
 
@@ -29,8 +28,8 @@ def information(
     deviations. An anchor contributes ``H - C^T (I + U)^-1 C``, where H, U and C are the weighted
     sums of J J^T, p p^T and p J^T.
     """
-    J, p, solved = np.empty(6), np.empty(3), np.empty(3)
-    U, L, C = np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 3))
+    J, p, solved = workspace((6,)), workspace((3,)), workspace((3,))
+    U, L, C = workspace((3, 3)), workspace((3, 3)), workspace((6, 3))
     for i in range(6):
         for j in range(6):
             told[i, j] = prior[i, j]

@@ -20,6 +20,7 @@ from rbl_gym.kernels.linear_algebra import (
 )
 from rbl_gym.kernels.pose_filter import keep_wide
 from rbl_gym.kernels.pose_solver import copy_pose, mirror
+from rbl_gym.kernels.workspace import workspace
 
 # Largest step (rad, m) on any axis.
 _LONGEST = 1e12
@@ -35,7 +36,7 @@ def predict(
     Q0, t0, extra0, P0, twist, dt, variance, wander, laws, n_twist, Q, t, extra, P
 ):  # fmt: skip
     """Predict pose, twist and biases: ``F P F^T + G Q G^T`` with decaying biases."""
-    turn, J, both = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    turn, J, both = workspace((3, 3)), workspace((3, 3)), workspace((3, 3))
     kept = np.empty(max(1, laws.shape[0]))
     size = P0.shape[0]
     unknown = n_twist > 0
@@ -131,12 +132,12 @@ def update(
                 chosen[count] = m * n_tags + n
                 count += 1
     chosen = chosen[:count]
-    six = np.empty((7, 6, 6))
+    six = workspace((7, 6, 6))
     information, A, best, L6, pose, at_start = six[0], six[1], six[2], six[3], six[4], six[5]
     g, new_g, step, e = six[6, 0], six[6, 1], six[6, 2], six[6, 3]
-    small = np.empty((3, 3, 3))
+    small = workspace((3, 3, 3))
     D, turn, new_Q = small[0], small[1], small[2]
-    new_t = np.empty(3)
+    new_t = workspace((3,))
     rows = np.empty((4, count, 6))
     of_pose, slope, H, B = rows[0], rows[1], rows[2], rows[3]
     own, L = np.empty((count, count)), np.empty((count, count))

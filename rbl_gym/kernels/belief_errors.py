@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc
 from rbl_gym.kernels.linear_algebra import cholesky6
 from rbl_gym.kernels.pose_bound import tag_square
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(d,d),(d),(s,s),(d,d),(d),(n,d)->(),(),(),(),()")
@@ -19,7 +18,7 @@ def judge(
     tags: Any, rotation_error: Any, position_error: Any, tag_error: Any, nees: Any, score: Any,
 ) -> None:  # fmt: skip
     """Compute angle, distance, RMS tag displacement, ``e^T P^-1 e`` and score b of P."""
-    work = np.empty((7, 6))
+    work = workspace((7, 6))
     L, e, turn = work[:6], work[6], work[:3, :3]
     for i in range(3):
         e[3 + i] = translation_hat[i] - translation[i]

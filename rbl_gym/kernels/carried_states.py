@@ -13,6 +13,7 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, multiply
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(d,d),(d),(k),(p,p),(d,d),(d),(q,q)->(k),(p,p)")
@@ -21,7 +22,7 @@ def carry(
 ) -> None:  # fmt: skip
     """Update further states by their correlation with the pose, and the joint covariance."""
     k = x0.shape[0]
-    room, D, turn, e = np.empty((3, 6, 6)), np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
+    room, D, turn, e = workspace((3, 6, 6)), workspace((3, 3)), workspace((3, 3)), workspace((6,))
     own, L, inverse = room[0], room[1], room[2]
     gain, slope, across = np.empty((k, 6)), np.empty((k, 6)), np.empty((k, 6))
     for i in range(6):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from rbl_gym.kernels.jit import helper
+from rbl_gym.kernels.workspace import workspace
 
 _SWEEPS = 30
 
@@ -54,7 +53,7 @@ def eigen(A: Any, V: Any) -> None:
 @helper
 def nearest_rotation(M: Any, Q: Any) -> None:
     """Return the proper rotation Q nearest to M (3, 3): largest eigenvector of Horn's matrix."""
-    K, V = np.empty((4, 4)), np.empty((4, 4))
+    K, V = workspace((4, 4)), workspace((4, 4))
     K[0, 0] = M[0, 0] + M[1, 1] + M[2, 2]
     K[1, 1] = M[0, 0] - M[1, 1] - M[2, 2]
     K[2, 2] = -M[0, 0] + M[1, 1] - M[2, 2]

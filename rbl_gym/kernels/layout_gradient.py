@@ -13,6 +13,7 @@ from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, invert_factored6
 from rbl_gym.kernels.noise_laws import reference_of, weight, weight_slopes
 from rbl_gym.kernels.pose_bound import add_range_information, tag_square
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(m,d),(m,d),(p,d,d),(p,d),(p),(p,s,s),(n,d),(l),(g),(p,m,n)->(),(m,d)")
@@ -26,7 +27,7 @@ def square_and_gradient(
     q^T K q``. The derivative by the anchor includes those of g and of ``d = s_n - a_m``.
     """
     n_anchors, n_tags = anchors.shape[0], tags.shape[0]
-    work, K = np.empty((3, 6, 6)), np.empty((6, 6))
+    work, K = workspace((3, 6, 6)), workspace((6, 6))
     information, L, P = work[0], work[1], work[2]
     # The gain of each link at a pose and its derivative, and its information with the gain.
     gains, shares = np.empty((n_tags, n_anchors, 4)), np.empty((n_anchors, n_tags))

@@ -14,12 +14,13 @@ from rbl_gym.kernels.pose_bound import (
     square_of_information,
     tag_square,
 )
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(p,s,s),(p,d,d),(n,d),(p)->()")
 def weighted_square(information: Any, rotation: Any, tags: Any, weight: Any, square: Any) -> None:
     """Return the sum of b^2 over the poses, weighted, from the information at each."""
-    work = np.empty((2, 6, 6))
+    work = workspace((2, 6, 6))
     total = 0.0
     for k in range(rotation.shape[0]):
         total += weight[k] * square_of_information(information[k], rotation[k], tags, work)
@@ -32,7 +33,7 @@ def mean_square(
     square: Any,
 ) -> None:  # fmt: skip
     """Return the mean of b^2 over the poses; `share` has each anchor's information fraction."""
-    work = np.empty((3, 6, 6))
+    work = workspace((3, 6, 6))
     shares = np.empty((anchors.shape[0], tags.shape[0]))
     total = 0.0
     for k in range(rotation.shape[0]):

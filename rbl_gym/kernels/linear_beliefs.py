@@ -13,6 +13,7 @@ from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, invert_factored6, of_size
 from rbl_gym.kernels.linear_filter import innovation, spread
 from rbl_gym.kernels.rotation_fits import fit_rotation, nearest_rotation
+from rbl_gym.kernels.workspace import workspace, zeros
 
 _cholesky3, _, _invert_factored3 = of_size(3)
 _cholesky9, _solve_factored9, _invert_factored9 = of_size(9)
@@ -31,7 +32,7 @@ def _split(state: Any, translation: Any, matrix: Any) -> None:
 @helper
 def _rotation_of(state: Any, Q: Any) -> None:
     """Compute the proper rotation nearest to the columns in a state; Q may not share its memory."""
-    work = np.empty((4, 3))
+    work = workspace((4, 3))
     _split(state, work[3], work[:3])
     nearest_rotation(work[:3], Q)
 
@@ -46,7 +47,7 @@ def _store(Q: Any, state: Any) -> None:
 @gufunc("(p),(p,p)->(p)")
 def coupled_fit(mean: Any, P: Any, fitted: Any) -> None:
     """Fit the pose to a linear posterior in its covariance's norm, (23) of the tracking paper."""
-    work = np.empty((21, 9))
+    work = workspace((21, 9))
     L, W, Q = work[:9], work[9:18], work[18:21, :3]
     _cholesky9(P, L)
     _invert_factored9(L, W)
@@ -71,7 +72,7 @@ def decoupled_fit(
 
     Weights are the same for all tags.
     """
-    work = np.empty((30, 9))
+    work = workspace((30, 9))
     L, W, Q, V = work[:9], work[9:18], work[18:21, :3], work[21:24, :3]
     y, G, target, small = work[24:28, :3], work[28, :6], work[29], work[18:21, 3:6]
     spread(anchors, weights, 0, G)
@@ -140,7 +141,7 @@ def projected_belief(
     """
     _split(mean, translation, matrix)
     nearest_rotation(matrix, rotation)
-    work = np.empty((6, 12))
+    work = workspace((6, 12))
     for j in range(12):
         for i in range(3):
             work[i, j] = 0.0
@@ -175,7 +176,7 @@ def constrained_belief(
     """
     _split(mean, translation, matrix)
     nearest_rotation(matrix, rotation)
-    L, Z = np.empty((12, 12)), np.zeros((12, 6))
+    L, Z = workspace((12, 12)), zeros((12, 6))
     for k in range(3):
         x, y, z = rotation[0, k], rotation[1, k], rotation[2, k]
         Z[3 * k, 1], Z[3 * k, 2] = z, -y
@@ -183,7 +184,7 @@ def constrained_belief(
         Z[3 * k + 2, 0], Z[3 * k + 2, 1] = y, -x
         Z[9 + k, 3 + k] = 1.0
     _cholesky12(P, L)
-    information = np.zeros((6, 6))
+    information = zeros((6, 6))
     for i in range(12):
         for j in range(6):
             total = Z[i, j]

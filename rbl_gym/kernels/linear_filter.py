@@ -15,6 +15,7 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import factor_semidefinite, fill, of_size
+from rbl_gym.kernels.workspace import workspace, zeros
 
 _STATES = 12
 # Larger than any length.
@@ -28,7 +29,7 @@ def predict_mean(mean: Any, twist: Any, dt: float, new_mean: Any) -> None:
 
     F is blkdiag(R, R, R, I) with ``R = exp(w dt)``.
     """
-    R = np.empty((3, 3))
+    R = workspace((3, 3))
     rotations.exp(dt * twist[0], dt * twist[1], dt * twist[2], R)
     for i in range(3):
         for k in range(3):
@@ -41,7 +42,7 @@ def predict_mean(mean: Any, twist: Any, dt: float, new_mean: Any) -> None:
 @gufunc("(p,p),(s),(),(p)->(p,p)")
 def predict_covariance(P: Any, twist: Any, dt: float, rate: Any, new_P: Any) -> None:
     """Compute ``P <- F P F^T + dt diag(rate)``, F as in `predict_mean`."""
-    work = np.empty((2, 3, 3))
+    work = workspace((2, 3, 3))
     R, half = work[0], work[1]
     rotations.exp(dt * twist[0], dt * twist[1], dt * twist[2], R)
     for k in range(4):
@@ -183,7 +184,7 @@ def innovation(
 
 @helper
 def _take_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
-    work = np.empty((2, _STATES, _STATES))
+    work = workspace((2, _STATES, _STATES))
     L, information = work[0], work[1]
     _cholesky(P, L)
     _invert_factored(L, information)
@@ -201,7 +202,7 @@ def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any)
 @gufunc("(p,p)->(p,p)")
 def inverse(matrix: Any, inverted: Any) -> None:
     """Compute the inverse of a symmetric positive definite matrix of the filter's size."""
-    L = np.empty((_STATES, _STATES))
+    L = workspace((_STATES, _STATES))
     _cholesky(matrix, L)
     _invert_factored(L, inverted)
 
@@ -210,7 +211,7 @@ def inverse(matrix: Any, inverted: Any) -> None:
 def _take_mean(
     mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any
 ) -> None:
-    y = np.empty((4, 3))
+    y = workspace((4, 3))
     innovation(mean, ranges, anchors, tags, weights, tags, y)
     for i in range(_STATES):
         total = mean[i]
@@ -298,12 +299,11 @@ def compress(ranges: Any, anchors: Any, tags: Any, weights: Any, like: Any, z: A
     ``H^T H`` is the information and ``H^T z`` its vector, where H is the transposed Cholesky
     factor. `like` (12,) only defines the shapes of the results.
     """
-    work = np.zeros((3, _STATES, _STATES))
-    L, information, y = work[0], work[1], work[2, :4, :3]
+    L, information = workspace((_STATES, _STATES)), zeros((_STATES, _STATES))
+    y = workspace((4, 3))
     _add_information(information, anchors, tags, weights)
     factor_semidefinite(information, L)
-    # The innovation for a state of zeros.
-    innovation(work[2, 4], ranges, anchors, tags, weights, tags, y)
+    innovation(zeros((_STATES,)), ranges, anchors, tags, weights, tags, y)
     for i in range(_STATES):
         total = y[i // 3, i % 3]
         for k in range(i):

@@ -13,8 +13,9 @@ import numpy as np
 from rbl_gym.kernels.eigen import eigen, nearest_rotation
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, of_size
-from rbl_gym.kernels.pose_solver import copy_pose, room_to_solve, solve, take_linearization
+from rbl_gym.kernels.pose_solver import copy_pose, mirror, solve
 from rbl_gym.kernels.range_cost import set_huber
+from rbl_gym.kernels.workspace import workspace, zeros
 
 _cholesky3, _solve3, _invert3 = of_size(3)
 
@@ -44,7 +45,7 @@ def points_start(ranges, weights, anchors, tags, Q, t):
     t[0] = t[1] = t[2] = math.nan
     n_anchors, n_tags = ranges.shape
     places, known = np.empty((n_tags, 3)), np.zeros(n_tags)
-    G, L, b, mean = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    G, L, b, mean = workspace((3, 3)), workspace((3, 3)), workspace((3,)), workspace((3,))
     count = 0
     for n in range(n_tags):
         total, middle = 0.0, 0.0
@@ -89,7 +90,7 @@ def points_start(ranges, weights, anchors, tags, Q, t):
             count += 1
     if count < 3:
         return
-    centre, middle_of_tags, M = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    centre, middle_of_tags, M = zeros((3,)), zeros((3,)), zeros((3, 3))
     for n in range(n_tags):
         if known[n] > 0:
             for i in range(3):
@@ -120,8 +121,8 @@ def in_doubt(H: Any, cost: float, weights: Any, anchors: Any) -> bool:
     free = max(links - 6, 1)
     if 2 * cost - (links - 6) > SUSPICIOUS * math.sqrt(2 * free):
         return True
-    S, V = np.zeros((3, 3)), np.empty((3, 3))
-    mean = np.zeros(3)
+    S, V = zeros((3, 3)), workspace((3, 3))
+    mean = zeros((3,))
     for m in range(n_anchors):
         for i in range(3):
             mean[i] += anchors[m, i] / n_anchors
@@ -133,7 +134,7 @@ def in_doubt(H: Any, cost: float, weights: Any, anchors: Any) -> bool:
     least, most = min(S[0, 0], S[1, 1], S[2, 2]), max(S[0, 0], S[1, 1], S[2, 2])
     if least < FLAT * FLAT * most:
         return True
-    L, P = np.empty((6, 6)), np.empty((6, 6))
+    L, P = workspace((6, 6)), workspace((6, 6))
     if not cholesky6(H, L):
         return True
     invert_factored6(L, P)
@@ -149,7 +150,7 @@ def candidate_places(ranges: Any, weights: Any, anchors: Any, places: Any) -> No
     """
     n_anchors, n_tags = ranges.shape
     squared, d = np.zeros(n_anchors), np.empty(n_anchors)
-    S, V, mean = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
+    S, V, mean = zeros((3, 3)), workspace((3, 3)), zeros((3,))
     seen = 0
     for m in range(n_anchors):
         count = 0
@@ -173,7 +174,7 @@ def candidate_places(ranges: Any, weights: Any, anchors: Any, places: Any) -> No
             d[m] -= (anchors[m, i] - mean[i]) ** 2
         if squared[m] >= 0:
             middle += d[m] / seen
-    pull = np.zeros(3)
+    pull = zeros((3,))
     for m in range(n_anchors):
         if squared[m] >= 0:
             for i in range(3):
@@ -278,7 +279,7 @@ def starts(
     ranges: Any, weights: Any, anchors: Any, tags: Any, net: Any, centre: Any, Qs: Any, ts: Any
 ) -> None:
     """Compute the best rotations of the net at three positions, as poses (3 STARTS, ...)."""
-    places, cost, order = np.empty((3, 3)), np.empty(len(net)), np.empty(STARTS, np.int64)
+    places, cost, order = workspace((3, 3)), np.empty(len(net)), np.empty(STARTS, np.int64)
     candidate_places(ranges, weights, anchors, places)
     t = np.empty((len(net), 3))
     for p in range(3):
@@ -296,11 +297,10 @@ def starts(
 @helper
 def search(
     ranges: Any, weights: Any, anchors: Any, tags: Any, net: Any, has_first: bool,
-    Q: Any, t: Any, other_Q: Any, other_t: Any, other_cost: Any, room: Any,
+    Q: Any, t: Any, other_Q: Any, other_t: Any, other_cost: Any, loss: Any, g: Any, H: Any,
 ) -> tuple[float, bool]:  # fmt: skip
     """Find the best of many local solutions and alternatives; `has_first`: (Q, t) is a solution."""
-    centre, loss = np.zeros(3), room[3]
-    set_huber(loss, math.inf)
+    centre = zeros((3,))
     for n in range(tags.shape[0]):
         for i in range(3):
             centre[i] += tags[n, i] / tags.shape[0]
@@ -318,8 +318,8 @@ def search(
         for s in range(count):
             if stage == 0 or counted[s]:
                 costs[s], good[s] = solve(
-                    Qs[s], ts[s], False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0,
-                    25 if stage else 10, 1e-6 if stage else 1e-2, room,
+                    Qs[s], ts[s], False, Q, t, H, ranges, weights, anchors, tags, loss, 0,
+                    25 if stage else 10, 1e-6 if stage else 1e-2, g, H,
                 )  # fmt: skip
             else:
                 costs[s] = math.inf
@@ -347,9 +347,7 @@ def search(
                     other_cost[kept - 2] = costs[s]
     copy_pose(Qs[order[0]], ts[order[0]], Q, t)
     # If many poses are nearly as good, the valley of the cost is long.
-    return solve(
-        Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0, 100, 1e-6, room
-    )
+    return solve(Q, t, False, Q, t, H, ranges, weights, anchors, tags, loss, 0, 100, 1e-6, g, H)
 
 
 @gufunc(
@@ -367,8 +365,7 @@ def most_likely_pose(
             other_t[k, i] = 0.0
             for j in range(3):
                 other_Q[k, i, j] = 1.0 if i == j else 0.0
-    room = room_to_solve()
-    loss = room[3]
+    loss = workspace((5,))
     set_huber(loss, math.inf)
     usable = True
     for i in range(3):
@@ -379,10 +376,11 @@ def most_likely_pose(
     converged[0] = False
     if usable:
         cost[0], converged[0] = solve(
-            Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0, 12, 3e-6, room
+            Q, t, False, Q, t, H, ranges, weights, anchors, tags, loss, 0, 12, 3e-6, g, H
         )
-    if not converged[0] or in_doubt(room[1], cost[0], weights, anchors):
+    if not converged[0] or in_doubt(H, cost[0], weights, anchors):
         cost[0], converged[0] = search(
-            ranges, weights, anchors, tags, net, usable, Q, t, other_Q, other_t, other_cost, room
-        )
-    take_linearization(room, g, H)
+            ranges, weights, anchors, tags, net, usable, Q, t, other_Q, other_t, other_cost,
+            loss, g, H,
+        )  # fmt: skip
+    mirror(H)

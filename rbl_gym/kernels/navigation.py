@@ -11,6 +11,7 @@ import numpy as np
 
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper, inlined
+from rbl_gym.kernels.workspace import workspace
 
 
 @inlined
@@ -158,9 +159,9 @@ def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
     """Compute state and covariance after the samples of an interval."""
     n = P0.shape[0]
     # Fewer allocations: each takes as long as a small product.
-    room, rows, before = np.empty((25, 3, 3)), np.empty((2, 9, n)), np.empty((n, n))
+    room, rows, before = workspace((25, 3, 3)), np.empty((2, 9, n)), np.empty((n, n))
     R, turned, half, lean = room[0], room[1], room[2], room[3]
-    J, N, F, moves = room[4:9], room[9:12], room[12:17], np.empty((8, 3))
+    J, N, F, moves = room[4:9], room[9:12], room[12:17], workspace((8, 3))
     moved, gone = moves[:4], moves[4:]
     for i in range(3):
         for j in range(3):

@@ -15,6 +15,7 @@ from rbl_gym.kernels.epoch import tag_position
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.noise_laws import reference_of, weight
 from rbl_gym.kernels.range_cost import is_plain, loss_of, squared_residuals
+from rbl_gym.kernels.workspace import workspace, zeros
 
 # Steps to the best offset for a loss other than squares.
 STEPS = 20
@@ -52,7 +53,7 @@ def add_centred(
     C C^T``. Its lower half is added to H (6, 6). The gradient is ``sum w x C``.
     """
     groups = max(anchors.shape[0], tags.shape[0])
-    mean, total, J = np.zeros((groups, 6)), np.zeros(groups), np.empty(6)
+    mean, total, J = np.zeros((groups, 6)), np.zeros(groups), workspace((6,))
     for again in range(2):
         for n in range(tags.shape[0]):
             x, y, z = tag_position(Q, t, tags, n)
@@ -180,7 +181,7 @@ def information(
     prior, anchors, tags, rotation, translation, law, share, offset, told
 ):  # fmt: skip
     """Add the information of ranges with offsets, times each link's fraction, to a prior's."""
-    weights, nothing, g = np.empty(share.shape), np.zeros(share.shape), np.zeros(6)
+    weights, nothing, g = np.empty(share.shape), np.zeros(share.shape), zeros((6,))
     for n in range(tags.shape[0]):
         reference = reference_of(law, n)
         x, y, z = tag_position(rotation, translation, tags, n)

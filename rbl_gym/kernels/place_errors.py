@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from rbl_gym.kernels.jit import gufunc
 from rbl_gym.kernels.linear_algebra import cholesky6, invert_factored6
 from rbl_gym.kernels.pose_bound import tag_square
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(t,s,s),(t,s,s),(t,d,d),(n,d)->(),(),(),(),(),()")
@@ -21,7 +20,7 @@ def mean_squares(
     position: Any, rotated: Any, tag: Any, horizontal: Any, height: Any, heading: Any,
 ) -> None:  # fmt: skip
     """Compute mean squares of the six errors over the rotations, for information base + part."""
-    F, L, P = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    F, L, P = workspace((6, 6)), workspace((6, 6)), workspace((6, 6))
     position[0] = rotated[0] = tag[0] = horizontal[0] = height[0] = heading[0] = 0.0
     n_turns = base.shape[0]
     for t in range(n_turns):
@@ -45,7 +44,7 @@ def mean_squares(
 @gufunc("(t,s,s),(t,s,s)->(),(),()")
 def asked_squares(base: Any, part: Any, horizontal: Any, height: Any, heading: Any) -> None:
     """Compute `mean_squares` of the required errors from the factor inverse's last columns."""
-    F, L = np.empty((6, 6)), np.empty((6, 6))
+    F, L = workspace((6, 6)), workspace((6, 6))
     across = up = turn = 0.0
     n_turns = base.shape[0]
     for t in range(n_turns):

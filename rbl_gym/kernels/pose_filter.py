@@ -14,11 +14,14 @@ from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
 from rbl_gym.kernels.offsets import squared_residuals_of
-from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
+from rbl_gym.kernels.pose_solver import copy_pose, mirror, solve
 from rbl_gym.kernels.range_cost import loss_of, set_huber
+from rbl_gym.kernels.workspace import workspace, zeros
 
 # Larger than any length.
 HUGE = 1e50
+# The largest weight: compilers make slow code of a comparison with infinity.
+LARGEST = 1e300
 # Whitened residual at which Huber's loss changes from squares to absolute values.
 HUBER = 1.5
 # Number of standard deviations beyond which a link contradicts a pose.
@@ -39,7 +42,7 @@ THIN = 0.01
 @gufunc("(d,d),(d),(p,p),(p),(),(p)->(d,d),(d),(p,p)")
 def predict(Q0, t0, P0, twist, dt, variance, Q, t, P):
     """Predict pose and covariance: ``F P F^T + dt G S G^T``."""
-    turn, J, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    turn, J, half = workspace((3, 3)), workspace((3, 3)), workspace((3, 3))
     x, y, z = twist[0] * dt, twist[1] * dt, twist[2] * dt
     rotations.exp(x, y, z, turn)
     rotations.left_jacobian(x, y, z, J)
@@ -101,7 +104,7 @@ def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, signed: bool, weight
                     weight *= 4 * distance * distance / (floor * told_by * told_by)
                 else:
                     weight /= floor + growth * told_by * told_by
-            if not 0 < weight < math.inf:
+            if not 0 < weight < LARGEST:
                 return False
             weights[m, n] = weight
     return True
@@ -216,9 +219,9 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
     pairs = xx * yy + yy * zz + xx * zz - xy * xy - xz * xz - yz * yz
     if not pairs <= THIN * trace * trace:
         return
-    back, there, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    D, T = np.zeros((6, 6)), np.zeros((6, 6))
-    a, b = np.zeros(3), np.zeros(3)
+    back, there, turned = workspace((3, 3)), workspace((3, 3)), workspace((3, 3))
+    D, T = zeros((6, 6)), zeros((6, 6))
+    a, b = workspace((3,)), workspace((3,))
     for i in range(3):
         a[i] = Q0[i, 0] * cx + Q0[i, 1] * cy + Q0[i, 2] * cz
         b[i] = Q[i, 0] * cx + Q[i, 1] * cy + Q[i, 2] * cz
@@ -276,8 +279,8 @@ def update(
     leaves out those beyond each cutoff (2 and 3). With LATE it goes from Huber's loss to the
     redescending one.
     """
-    room = room_to_solve()
-    H, information, loss, L = room[1], room[2], room[3], room[4]
+    H, information, L = workspace((6, 6)), workspace((6, 6)), workspace((6, 6))
+    g, loss = workspace((6,)), workspace((5,))
     set_huber(loss, math.inf)
     weights = np.empty(shares.shape)
     kept, tolerance = weights, 1e-6
@@ -318,7 +321,7 @@ def update(
             copy_pose(start_Q, start_t, Q, t)
         total, _ = solve(
             Q, t, True, Q0, t0, information, ranges, kept, anchors, tags, loss, offset,
-            iterations, tolerance, room,
+            iterations, tolerance, g, H,
         )  # fmt: skip
         if robust == SQUARES or (robust == LATE and stage == 1):
             break

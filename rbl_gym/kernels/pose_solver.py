@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from rbl_gym.kernels.jit import gufunc, helper, inlined
 from rbl_gym.kernels.linear_algebra import cholesky6, solve_factored6
 from rbl_gym.kernels.offsets import linearize_shifted
 from rbl_gym.kernels.range_cost import linearize
 from rbl_gym.kernels.rotations import compose, exp, left_jacobian_inverse, log
+from rbl_gym.kernels.workspace import workspace
 
 # Largest step (rad, m) on any axis.
 _LONGEST = 1e12
@@ -76,15 +75,17 @@ def add_prior(
 def solve(
     Q: Any, t: Any, has_prior: bool, Q0: Any, t0: Any, information: Any,
     ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
-    iterations: int, tolerance: float, room: Any,
+    iterations: int, tolerance: float, g: Any, H: Any,
 ) -> tuple[float, bool]:  # fmt: skip
     """Move the pose (Q, t) to the nearest minimum; return its cost and whether it converged.
 
-    `offset` is the kind of the ranges' offsets, as in `kernels.offsets`, 0 for none. `room` comes
-    from `room_to_solve`. Its first two arrays become the gradient and the lower half of the Hessian
-    at the minimum.
+    `offset` is the kind of the ranges' offsets, as in `kernels.offsets`, 0 for none. g and H become
+    the gradient and the lower half of the Hessian at the minimum. Without a prior, `information` is
+    not read.
     """
-    g, H, _, _, L, new_g, new_H, new_Q, new_t, turn, D, step, e = room
+    L, new_H = workspace((6, 6)), workspace((6, 6))
+    new_g, step, e = workspace((6,)), workspace((6,)), workspace((6,))
+    new_Q, turn, D, new_t = workspace((3, 3)), workspace((3, 3)), workspace((3, 3)), workspace((3,))
     copy_pose(Q, t, new_Q, new_t)
     cost, decrease, damping, converged = 0.0, 0.0, 0.0, False
     for k in range(iterations + 1):
@@ -131,36 +132,12 @@ def solve(
 
 
 @inlined
-def room_to_solve() -> Any:
-    """Return workspace from two allocations, because allocations are slow.
-
-    A gradient (6,) and a Hessian (6, 6); an information (6, 6), a loss (6,) and a factor (6, 6),
-    inputs of `solve` or unused; and its further workspace.
-    """
-    large, small = np.empty((5, 6, 6)), np.empty((3, 3, 3))
-    rows = large[4]
-    return (
-        rows[0], large[0], large[1], rows[1], large[2], rows[2], large[3], small[0], rows[3],
-        small[1], small[2], rows[4], rows[5],
-    )  # fmt: skip
-
-
-@inlined
 def copy_pose(Q0: Any, t0: Any, Q: Any, t: Any) -> None:
     """``Q[:], t[:] = Q0, t0``."""
     for i in range(3):
         t[i] = t0[i]
         for j in range(3):
             Q[i, j] = Q0[i, j]
-
-
-@helper
-def take_linearization(room: Any, g: Any, H: Any) -> None:
-    """Copy the gradient and the whole Hessian that `solve` computed."""
-    for i in range(6):
-        g[i] = room[0][i]
-        for j in range(i + 1):
-            H[i, j] = H[j, i] = room[1][i, j]
 
 
 @helper
@@ -182,11 +159,10 @@ def minimize(
     """Run `solve` from a start; without a prior if its information is zero."""
     copy_pose(start_Q, start_t, Q, t)
     has_prior = False
-    room = room_to_solve()
     for i in range(6):
         has_prior = has_prior or information[i, i] != 0.0
     cost[0], converged[0] = solve(
         Q, t, has_prior, Q0, t0, information, ranges, weights, anchors, tags, loss, offset,
-        iterations, tolerance, room,
+        iterations, tolerance, g, H,
     )  # fmt: skip
-    take_linearization(room, g, H)
+    mirror(H)

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.workspace import workspace
 
 # Determinant at unit norm (at most 0.19) above which the polar iteration is exact to 1e-13.
 _WELL_CONDITIONED = 1e-3
@@ -107,7 +106,7 @@ def _nearest_by_quaternion(Q: Any) -> None:
     Its quaternion is the eigenvector of the largest eigenvalue of Horn's 4 x 4 matrix, computed by
     Jacobi rotations.
     """
-    work = np.empty((2, 4, 4))
+    work = workspace((2, 4, 4))
     K, V = work[0], work[1]
     xx, yy, zz = Q[0, 0], Q[1, 1], Q[2, 2]
     K[0, 0], K[1, 1], K[2, 2], K[3, 3] = xx + yy + zz, xx - yy - zz, yy - xx - zz, zz - xx - yy
@@ -173,9 +172,9 @@ def fit_rotation(W: Any, target: Any, Q: Any) -> float:
     The Hessian is exact, and damped if it is not positive definite or the cost would increase. ``Q
     <- exp(w) Q``.
     """
-    work = np.empty((5, 9))
+    work = workspace((5, 9))
     pull, new_pull = work[0], work[1]
-    T, step = work[2:5], np.empty((2, 3, 3))
+    T, step = work[2:5], workspace((2, 3, 3))
     turn, candidate = step[0], step[1]
     cost = _pull(W, target, Q, pull)
     damping = 0.0
