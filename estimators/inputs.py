@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -118,7 +119,7 @@ def check_epoch(
     if (
         links is None
         and not signed
-        and is_plain_epoch(ranges, anchors, tags, ())
+        and links_of_plain_epoch(ranges, anchors, tags, ()) is not None
         and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportCallIssue, reportArgumentType]
         and are_positive(ranges)  # pyright: ignore[reportArgumentType]
     ):
@@ -171,29 +172,39 @@ def check_offset_epoch(
     return OffsetEpoch(np.where(there, ranges - means, 0.0), anchors, there)
 
 
-def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int, ...]) -> bool:
-    """Return whether these are float64 arrays for the tags of one body and trials (*batch).
+def links_of_plain_epoch(
+    ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int, ...]
+) -> FloatArray | None:
+    """Return read-only ones (M, N) if these are float64 arrays of trials (*batch), else None.
 
-    Ranges (*batch, M, N), anchors (*batch, M, 3), tags (N, 3); their values are not checked.
+    Ranges (*batch, M, N), anchors (*batch, M, 3), tags of one body (N, 3); their values are not
+    checked.
     """
-    if not (type(ranges) is type(anchors) is np.ndarray):
-        return False
-    shape = ranges.shape
-    return (
-        anchors.shape == (*shape[:-1], 3)
-        and shape[:-2] == batch
-        and shape[-1:] == tags.shape[:-1]
-        and len(shape) > 1
-        and ranges.size > 0
+    if (
+        type(ranges) is type(anchors) is np.ndarray
         # Not by identity, because pickled arrays have their own dtype object.
         and ranges.dtype == anchors.dtype == _FLOAT64
-    )
+    ):
+        return _links_of_shapes(ranges.shape, anchors.shape, tags.shape, batch)
+    return None
 
 
-@functools.lru_cache(64)
-def all_links(n_anchors: int, n_tags: int) -> FloatArray:
-    """Return read-only ones (M, N)."""
-    ones = np.ones((n_anchors, n_tags))
+@functools.lru_cache(256)
+def _links_of_shapes(
+    ranges: tuple[int, ...],
+    anchors: tuple[int, ...],
+    tags: tuple[int, ...],
+    batch: tuple[int, ...],
+) -> FloatArray | None:
+    if not (
+        len(anchors) > 1
+        and anchors == (*batch, anchors[-2], 3)
+        and ranges == (*batch, anchors[-2], tags[0])
+        and len(tags) == 2
+        and math.prod(ranges) > 0
+    ):
+        return None
+    ones = np.ones(ranges[-2:])
     ones.flags.writeable = False
     return ones
 

@@ -21,6 +21,7 @@ from rbl_gym.geometry import rotations
 
 # Above this standard deviation (rad) of the prior rotation, one linearisation is not sufficient.
 VAGUE_ROTATION_RAD = 0.5
+VAGUE_ROTATION_VARIANCE = VAGUE_ROTATION_RAD**2
 
 _NET = rotations.log(ROTATION_NET)
 
@@ -30,7 +31,7 @@ Starts = Callable[[MapProblem], tuple[FloatArray, FloatArray]]
 
 def is_vague(covariance: FloatArray) -> BoolArray:
     """Return whether (...) the largest variance of the rotation exceeds `VAGUE_ROTATION_RAD`^2."""
-    limit = VAGUE_ROTATION_RAD**2
+    limit = VAGUE_ROTATION_VARIANCE
     # The trace bounds the largest eigenvalue, which suffices for most priors.
     if covariance.ndim == 2:
         trace = covariance.item(0, 0) + covariance.item(1, 1) + covariance.item(2, 2)
@@ -83,7 +84,7 @@ def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> Bo
 def _vague_directions(covariance: FloatArray) -> np.ndarray:
     """Return the number (...) of vague principal axes of the rotation."""
     values = np.linalg.eigvalsh(covariance[..., :3, :3])
-    return (values > VAGUE_ROTATION_RAD**2).sum(axis=-1)
+    return (values > VAGUE_ROTATION_VARIANCE).sum(axis=-1)
 
 
 def global_start(

@@ -33,7 +33,7 @@ from rbl_gym.estimators.inputs import (
     check_one_process,
     check_prior,
     epoch_variance,
-    is_plain_epoch,
+    links_of_plain_epoch,
     plain,
 )
 from rbl_gym.estimators.linear.engines import (
@@ -237,7 +237,7 @@ class KalmanFamily:
             or self.weights is not None
             or self.constraint != "none"
             or state.covariance.shape[:-2] != batch
-            or not is_plain_epoch(ranges, anchors, self.tags, batch)
+            or links_of_plain_epoch(ranges, anchors, self.tags, batch) is None
         ):
             return None
         law = numbers_of(self.noise, len(self.tags))
