@@ -95,7 +95,7 @@ def test_prediction(seed, turn, dt):
 def test_update(seed, shape, geometry, robust, iterations, offset):
     prior, *data = epoch(seed, *shape, geometry=geometry, wrong=0.1 if robust else 0.0)
     ranges, weights, *places = data
-    args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], offset, iterations, robust
+    args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], (offset, iterations, robust)
     with np.errstate(all="ignore"):
         got, want = update_pose.kernel(*args), update_pose.textbook(*args)
     # A prior that is singular to rounding leaves a pose that means nothing.
@@ -117,7 +117,7 @@ def test_update(seed, shape, geometry, robust, iterations, offset):
 def test_update_by_the_numbers_of_a_law(law):
     prior, ranges, _, *places = epoch(3, 4, 3, lost=0.0)
     ranges[1, 2, 1] = -1.0
-    args = *prior, ranges, np.ones((4, 3)), law.numbers, *places, *prior[:2], 0, 3, False
+    args = *prior, ranges, np.ones((4, 3)), law.numbers, *places, *prior[:2], (0, 3, 0)
     with np.errstate(all="ignore"):
         got, want = update_pose.kernel(*args), update_pose.textbook(*args)
         weights = 1 / law.variance(ranges) + np.zeros_like(ranges)
@@ -179,7 +179,7 @@ def test_what_is_not_positive_definite_is_nan_in_both():
     P = prior[2].copy()
     P[1] = 0.01 * np.diag([1.0, 1, -1, 1, 1, 1])
     P[2, 0, 0] = np.nan
-    args = *prior[:2], P, *data[:2], WEIGHTS, *data[2:], *prior[:2], 0, 2, False
+    args = *prior[:2], P, *data[:2], WEIGHTS, *data[2:], *prior[:2], (0, 2, 0)
     for form in (update_pose.kernel, update_pose.textbook):
         with np.errstate(all="ignore"):
             got = form(*args)[2]

@@ -33,7 +33,6 @@ from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, update_pose
-from rbl_gym.estimators.iekf.robust_update import ROBUST
 from rbl_gym.estimators.inputs import check_batches, check_one_process, plain, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
@@ -223,9 +222,7 @@ class IteratedEkfBank:
                 epoch.anchors,
                 self.tags,
                 *start,
-                0,
-                self.iterations,
-                ROBUST[self.robust],
+                self._filter.options,
             )
         )
 

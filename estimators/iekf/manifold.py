@@ -100,10 +100,10 @@ class IteratedEkf:
         offsets.check_offset(self.offset)
 
     @functools.cached_property
-    def _codes(self) -> tuple[np.ndarray, ...]:
-        """Return the last arguments of `update_pose`, as arrays that a kernel need not convert."""
+    def options(self) -> np.ndarray:
+        """Return the options (3,) of `update_pose`."""
         codes = offsets.code_of(self.offset), self.iterations, check_robust(self.robust)
-        return tuple(map(np.asarray, codes))
+        return np.array(codes, np.int64)
 
     @functools.cached_property
     def _numbers(self) -> FloatArray | None:
@@ -143,7 +143,8 @@ class IteratedEkf:
             batches = {"twist": twist.shape[:-1], "dt": np.shape(dt)}
             batches["process"] = self._variance.shape[:-1]
             check_batches(state=state.translation.shape[:-1], **batches)
-        return PoseState(*predict_pose(*state, twist, dt, self._variance))
+        rotation, translation, P = state
+        return PoseState(*predict_pose(rotation, translation, P, twist, dt, self._variance))
 
     def update(
         self,
@@ -187,7 +188,7 @@ class IteratedEkf:
                 anchors,
                 self.tags,
                 *start,
-                *self._codes,
+                self.options,
             )[:3]
         )
 
@@ -212,11 +213,10 @@ class IteratedEkf:
             wide = is_vague(P).any()
         if numbers is None or wide:
             return None
-        offset, iterations, robust = self._codes
         # Arguments one by one: unpacking them takes a tenth of the time of the call.
         rotation, translation, P, cost = update_pose(
             rotation, translation, P, ranges, shares, numbers, anchors, tags,
-            rotation, translation, offset, iterations, robust,
+            rotation, translation, self.options,
         )  # fmt: skip
         # One number suffices: it is finite if the covariance is.
         if not all_finite(cost):
@@ -312,5 +312,6 @@ class IteratedEkf:
 
     def belief(self, state: PoseState) -> PoseBelief:
         """Return the state as a belief (copies)."""
-        rotation = state.rotation.copy()
-        return PoseBelief(rotation, state.translation.copy(), state.covariance.copy(), rotation)
+        rotation, translation, P = state
+        rotation = rotation.copy()
+        return PoseBelief(rotation, translation.copy(), P.copy(), rotation)

@@ -65,9 +65,7 @@ def update_pose(
     tags: FloatArray,
     start_rotation: FloatArray,
     start_translation: FloatArray,
-    offset: int,
-    iterations: int,
-    robust: int,
+    options: np.ndarray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the most likely pose of an epoch near a start, its covariance, and its cost.
 
@@ -82,19 +80,17 @@ def update_pose(
         (`noise_laws.numbers_of`), if all links were measured.
     start_rotation, start_translation
         Start of Gauss-Newton.
-    offset
-        Code of the kind of range offsets (`offsets.code_of`).
-    iterations
-        Maximum number of Gauss-Newton iterations.
-    robust
-        A value of `robust_update.ROBUST`. 1: the cost is Huber's loss of all links, constant beyond
-        `GATE`. 2: it is the redescending loss.
+    options
+        (3,) ints: the kind of range offsets (`offsets.code_of`), the maximum number of Gauss-Newton
+        iterations, and a value of `robust_update.ROBUST`. 1: the cost is Huber's loss of all links,
+        constant beyond `GATE`. 2: it is the redescending loss.
 
     Returns
     -------
     Rotation, translation, covariance, cost (...). The last two are NaN if a matrix is not
     positive definite, a used range is not positive, or a value is not finite.
     """
+    offset, iterations, robust = map(int, options)
     # The range of a lost link may have any value.
     ranges = np.where(shares == 0, 0.0, ranges)
     weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)

@@ -250,8 +250,8 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
 
 
 @gufunc(
-    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(),(),()->(d,d),(d),(p,p),()",
-    "ffffffffffiiiffff",
+    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(o)->(d,d),(d),(p,p),()",
+    "ffffffffffiffff",
 )
 def update(
     Q0,
@@ -264,9 +264,7 @@ def update(
     tags,
     start_Q,
     start_t,
-    offset,
-    iterations,
-    robust,
+    options,
     Q,
     t,
     P,
@@ -274,11 +272,14 @@ def update(
 ):
     """Compute the most likely pose of an epoch near a start, its covariance, and its cost.
 
-    With `robust` GATED, links that the prior contradicts are left out (stage 0). If the resulting
-    pose contradicts this choice, the update starts again with Huber's loss on all links (1), and
-    leaves out those beyond each cutoff (2 and 3). With LATE it goes from Huber's loss to the
-    redescending one.
+    `options` are the kind of the ranges' offsets, the number of iterations, and `robust`.
+
+    With GATED, links that the prior contradicts are left out (stage 0). If the resulting pose
+    contradicts this choice, the update starts again with Huber's loss on all links (1), and leaves
+    out those beyond each cutoff (2 and 3). With LATE it goes from Huber's loss to the redescending
+    one.
     """
+    offset, iterations, robust = options[0], options[1], options[2]
     H, information, L = workspace((6, 6)), workspace((6, 6)), workspace((6, 6))
     g, loss = workspace((6,)), workspace((5,))
     set_huber(loss, math.inf)
