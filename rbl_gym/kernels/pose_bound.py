@@ -22,6 +22,7 @@ from rbl_gym.kernels.linear_algebra import (
     invert_factored6,
 )
 from rbl_gym.kernels.noise_laws import reference_of, weight
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(s,s),(m,d),(n,d),(d,d),(d),(l),(m,n)->(s,s)")
@@ -197,7 +198,7 @@ def step_of_ranges(
     translation: Any, law: Any, share: Any, information: Any, score: Any,
 ) -> None:  # fmt: skip
     """Do a step of the posterior Cramer-Rao recursion with ranges; compute the score after it."""
-    work = np.empty((4, 6, 6))
+    work = workspace((4, 6, 6))
     _predict(prior, twist, dt, std, work, information)
     add_range_information(information, anchors, tags, rotation, translation, law, share)
     score[0] = math.sqrt(square_of_information(information, rotation, tags, work))
@@ -209,7 +210,7 @@ def step_of_angles(
     translation: Any, angle_std: float, information: Any, score: Any,
 ) -> None:  # fmt: skip
     """Do a step of the posterior Cramer-Rao recursion with angles; compute the score after it."""
-    work = np.empty((4, 6, 6))
+    work = workspace((4, 6, 6))
     _predict(prior, twist, dt, std, work, information)
     _add_angle_information(
         information, station, tags, rotation, translation, 1 / (angle_std * angle_std)
