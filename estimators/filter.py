@@ -97,7 +97,7 @@ def register(name: str, factory: Callable[..., Filter]) -> None:
     if "/" in name or "," in name:
         raise ValueError(f"name must have no '/' and no ',', got {name!r}")
     if _FACTORIES.setdefault(name, factory) is not factory:
-        raise ValueError(f"filter {name!r} is already registered")
+        raise ValueError(f"filter {name!r} is already registered: choose another name")
 
 
 def names() -> list[str]:

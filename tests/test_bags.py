@@ -595,9 +595,9 @@ def test_topics_and_fields_are_listed(small, capsys):
         ),
         (
             {"ranges": {**MINE, "range": "dist"}},
-            r"topic /uwb, \[ranges\]: no field 'dist', there is header, here, there, range_mm",
+            r"topic /uwb, \[ranges\]: no field 'dist', the fields are header, here, there",
         ),
-        ({"ranges": {**MINE, "tag": "header.frame"}}, "no field 'header.frame', there is"),
+        ({"ranges": {**MINE, "tag": "header.frame"}}, "no field 'header.frame', the fields are"),
         ({"ranges": {**MINE, "range": "header"}}, "range must be a number, got std_msgs__msg__Hea"),
         ({"ranges": {**MINE, "range": "a b"}}, "'a b' is not a field path"),
         ({"ranges": {**MINE, "anchor": "@node"}}, "'@node' must be one of"),
@@ -681,7 +681,7 @@ def test_field_paths_into_lists():
     ]
     with pytest.raises(ValueError, match=r"the same length, got \[2, 3\]"):
         bag_fields.rows(received, [bag_fields.getter("a[]"), bag_fields.getter("b[].c")])
-    with pytest.raises(KeyError, match="no item 'a\\[7\\]', there are 3"):
+    with pytest.raises(KeyError, match="no item 'a\\[7\\]', the list has 3"):
         bag_fields.getter("a[7]")(received)
 
 

@@ -432,7 +432,7 @@ def test_what_is_wrong_is_named_with_its_table(path, value, message):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("mounts", [{"kind": "points", "points": [[16, 5, 2.5]]}], "mounts have no permitted pl"),
+        ("mounts", [{"kind": "points", "points": [[16, 5, 2.5]]}], "mounts have no permitted po"),
         ("mounts", [{"kind": "points", "points": [[1, 1, 2.5]]}], "mounts have 1 permitted points"),
         ("forbidden.0.polygon", [[-9, -9], [99, -9], [99, 99], [-9, 99]], "mounts have no permi"),
         ("mounts.0", {"kind": "points", "points": [[1, 1, 1]], "axis": [0, 0, 0]},

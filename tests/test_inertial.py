@@ -380,7 +380,7 @@ def test_a_log_is_read_in_its_units(tmp_path):
         (ROWS, {"force_unit": "g"}, r"9.81 g, which does not fit a log in g \(is it in m/s\^2\?"),
         ([(t, *w, *np.array(a) / G) for t, *w, a in [(r[0], *r[1:4], r[4:]) for r in ROWS]], {},
          "is it in g, or was gravity"),
-        ([(r[0], 200, 0, 0, *r[4:]) for r in ROWS], {}, r"if it is in deg/s"),
+        ([(r[0], 200, 0, 0, *r[4:]) for r in ROWS], {}, r"are they in deg/s"),
     ],
 )  # fmt: skip
 def test_what_is_no_log(tmp_path, rows, options, message):

@@ -217,7 +217,7 @@ def test_wheels_of_a_file_without_a_header_by_number(tmp_path):
         ("t,vx,wz\n0,1,x\n", {}, "line 2, column 'wz'"),
         ("t,vx,wz\n1,1,0\n0,1,0\n", {}, "line 3, column 't'"),
         ("t,vx,wz\n0,1,90\n", {}, "deg/s"),
-        ("t,vx,wz\n0,800,0\n", {}, "millimetres"),
+        ("t,vx,wz\n0,800,0\n", {}, "are they in mm/s"),
         ("t,left,right,width\n0,1,1,0\n", {}, "width"),
         ("t,vx\n0,1\n", {"turn_unit": "rpm"}, "turn_unit"),
     ],

@@ -33,7 +33,7 @@ def said(capsys, *arguments):
             ["replay", *FILES, "--height-m", "1"],
             "--height-m needs --height-std-m, its",
         ),
-        (["replay", *FILES, "--plot", "x.foo"], "--plot: must end in .png, .*'x.foo'"),
+        (["replay", *FILES, "--plot", "x.foo"], "--plot: must end in one of .png, .*'x.foo'"),
         (["place", "--scene", "uwb_rom"], "--scene must be one of .* did you mean 'uwb_room'"),
         (["plac"], "did you mean 'place'"),
         (["train", "uwb_rom"], "did you mean 'uwb_room'"),
@@ -53,6 +53,9 @@ def test_files_columns_and_values_keep_their_names():
         "ranges must have at least one measured link, got none",
     ):
         assert cli.with_options(text, given, ["calibrate"]) == text
+    assert cli.with_options("relative needs carrier; set planar", given, []) == (
+        "relative needs --carrier; set --planar"
+    )
     told = cli.with_options("ranges or bias_m must be given", given, ["calibrate", "--ranges=x"])
     assert told == "--ranges or --bias-m must be given"
 
@@ -88,3 +91,11 @@ def test_ctrl_c_ends_without_a_traceback(monkeypatch, capsys):
     monkeypatch.setattr(cli, "_run", stop)
     assert cli.main([]) == cli.INTERRUPTED
     assert capsys.readouterr().err == "rbl-gym: interrupted\n"
+
+
+def test_a_missing_library_is_one_line(monkeypatch, capsys):
+    def missing(arguments):
+        raise ModuleNotFoundError("files with [[mounts]] need the package shapely: pip install ...")
+
+    monkeypatch.setattr("rbl_gym.app.place_command._place", missing)
+    assert said(capsys, "place", "--scene", "uwb_room").startswith("rbl-gym place: files with")

@@ -499,7 +499,7 @@ def test_a_carrier_that_is_nowhere(tmp_path):
     log = read(tmp_path, LONG + "1.5,A,1,2\n", carrier=TRUTH)
     assert log.report.dropped == {"where the carrier's pose is not known": 1}
     assert len(log.times) == 2
-    with pytest.raises(ValueError, match="relative needs a carrier"):
+    with pytest.raises(ValueError, match="relative needs carrier"):
         read_recording(
             Files(**write(tmp_path, ranges=LONG, anchors=ANCHORS, tags=TAGS), relative=True)
         )

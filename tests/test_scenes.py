@@ -241,7 +241,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"noise": {"floor": 1}},
         "scene.noise has no field 'floor'; its fields are floor_m, proportional",
     ),
-    ({"noise": {"kind": "range", "floor": 1}}, "scene.noise:"),
+    ({"noise": {"kind": "range", "floor": 1}}, "scene.noise has no field 'floor'"),
     ({"dt": {"value": 1}}, "scene.dt must be one value, got the dict {'value': 1}"),
     ({"noise": 0.1}, "scene.noise must be a dict of its fields, got 0.1"),
     ({"links": None}, "scene.links must be a dict of its fields, got None"),

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds
-from rbl_gym.checks import FloatArray, all_finite, check_number, imported
+from rbl_gym.checks import FloatArray, all_finite, check_number, did_you_mean, imported
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.metrics import Figures
 from rbl_gym.worlds.scene import Scene
@@ -126,7 +126,7 @@ def reward_of(reward: RewardLike) -> Reward:
         )
     raise ValueError(
         f"reward must be one of {', '.join(map(repr, REWARDS))}, a dict with a kind, "
-        f"'module:function' or a function, got {reward!r:.80}"
+        f"'module:function' or a function, got {reward!r:.80}{did_you_mean(reward, REWARDS)}"
     )
 
 
@@ -143,7 +143,7 @@ def _with_options(options: dict[str, Any]) -> Reward:
         if name not in known:
             raise ValueError(
                 f"reward {kind!r} has no option {name!r:.80}; its options are "
-                f"{', '.join([*known, 'action_price'])}"
+                f"{', '.join([*known, 'action_price'])}{did_you_mean(name, known)}"
             )
         check_number(f"reward.{name}", value, low=0.0)
     if kind == "requirement" and not options:

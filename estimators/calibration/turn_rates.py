@@ -70,7 +70,7 @@ def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
         values = np.linalg.svd(spread, compute_uv=False)
         if values[1] <= 1e-6 * max(values[0], 1e-12):
             raise ValueError(
-                "body must turn about at least two axes, or the axes of the sensor stay unknown"
+                "body must turn about two axes or more to determine the axes of the sensor"
             )
         R = rotations.nearest(spread)
         bias = mean_s - R.T @ mean_b

@@ -86,7 +86,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     except OSError as error:
         said = f"{error.filename}: {error.strerror}" if error.filename else error
         print(f"rbl-gym {options.command}: {said}", file=sys.stderr)
-    except (ValueError, GymError) as error:
+    except (ValueError, GymError, ModuleNotFoundError) as error:
         said = with_options(str(error), options, arguments)
         print(f"rbl-gym {options.command}: {said}", file=sys.stderr)
     return 2

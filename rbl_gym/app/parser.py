@@ -63,7 +63,7 @@ def with_options(message: str, given: argparse.Namespace, arguments: Sequence[st
     typed = {argument.partition("=")[0] for argument in arguments}
     if f"--{message.partition(' ')[0]}" in typed:
         message = f"--{message}"
-    message = re.sub(rf"(?<=needs )(?:{words})\b", r"--\g<0>", message)
+    message = re.sub(rf"\b(needs|set) ({words})\b", r"\1 --\2", message)
     for name in names:
         option = f"--{name.replace('_', '-')}"
         message = re.sub(rf"(?<![\w'\"./\[-]){name}(?![\w'\"./=])", option, message)

@@ -172,7 +172,7 @@ def check_report_options(options: argparse.Namespace) -> None:
 
     for path in options.export:
         if not path.lower().endswith(SUFFIXES):
-            raise ValueError(f"--export must end in {', '.join(SUFFIXES)}, got {path}")
+            raise ValueError(f"--export must end in one of {', '.join(SUFFIXES)}, got {path}")
         if path.lower().endswith(".dxf"):
             require("ezdxf", "placement")
     if options.report and not options.report.lower().endswith(".pdf"):

@@ -153,7 +153,7 @@ def natural(text: str) -> int:
 def _picture(text: str) -> str:
     """Return the name of a picture that matplotlib can write, for argparse."""
     if not text.lower().endswith(_PICTURES):
-        raise argparse.ArgumentTypeError(f"must end in {', '.join(_PICTURES)}, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must end in one of {', '.join(_PICTURES)}, got {text!r}")
     return text
 
 

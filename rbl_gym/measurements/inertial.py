@@ -21,7 +21,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_generator, check_number, check_one_of
+from rbl_gym.checks import (
+    FloatArray,
+    check_array,
+    check_generator,
+    check_number,
+    check_one_of,
+    did_you_mean,
+)
 from rbl_gym.geometry import rotations
 
 __all__ = [
@@ -149,7 +156,10 @@ def sensor(value: str | Mapping[str, Any] | InertialSensor) -> InertialSensor:
     known = list(InertialSensor.__dataclass_fields__)
     for key, number in value.items():
         if key != "kind" and key not in known:
-            raise ValueError(f"inertial has no field {key!r}; its fields are {', '.join(known)}")
+            raise ValueError(
+                f"inertial has no field {key!r}; its fields are {', '.join(known)}"
+                f"{did_you_mean(key, known)}"
+            )
         fields[key] = number
     return InertialSensor(**{key: fields[key] for key in known})
 

@@ -250,7 +250,7 @@ def _mounts(
     )
     if mounts is None:
         raise ValueError(
-            "mounts have no permitted place: obstacles and [[forbidden]] cover all of them"
+            "mounts have no permitted position: obstacles and [[forbidden]] cover them"
         )
     return mounts
 

@@ -118,7 +118,11 @@ def _walk(value: Any, parts: list[str]) -> Any:
             there = getattr(value, "__dataclass_fields__", None)
             raise KeyError(
                 f"no field {'.'.join(parts[: i + 1])!r}, "
-                + (f"there is {', '.join(names(there))}" if there else f"there is {value!r:.60}")
+                + (
+                    f"the fields are {', '.join(names(there))}"
+                    if there
+                    else f"there is {value!r:.60}"
+                )
             )
         value = getattr(value, name)
         if index == "]":
@@ -126,7 +130,9 @@ def _walk(value: Any, parts: list[str]) -> Any:
         if index:
             item = int(index[:-1])
             if item >= len(value):
-                raise KeyError(f"no item {'.'.join(parts[: i + 1])!r}, there are {len(value)}")
+                raise KeyError(
+                    f"no item {'.'.join(parts[: i + 1])!r}, the list has {len(value)} items"
+                )
             value = value[item]
     return value
 

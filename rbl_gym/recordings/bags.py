@@ -130,7 +130,7 @@ def show_message(log: Paths, topic: str, messages: AnyPath | None = None) -> lis
     with bag_reading.opened(log, messages) as reader:
         if topic not in (topics := bag_reading.types(reader)):
             raise ValueError(
-                f"{log_name(log)}: no topic {topic!r}, the topics are {', '.join(topics)}"
+                f"{log_name(log)}: no topic {topic!r}; the topics are {', '.join(topics)}"
             )
         for received in bag_reading.messages(reader, [topic], lambda steps: None):
             return bag_fields.describe(received.message)

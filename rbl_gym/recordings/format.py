@@ -74,10 +74,10 @@ class Files:
     def __post_init__(self) -> None:
         if self.carrier is not None and self.anchors is None:
             raise ValueError(
-                "carrier needs anchors: a table of the anchors in the frame of the carrier"
+                "carrier needs anchors, a table of the anchors in the frame of the carrier"
             )
         if self.relative and self.carrier is None:
-            raise ValueError("relative needs a carrier: the poses of the body with the anchors")
+            raise ValueError("relative needs carrier, the poses of the body with the anchors")
         if self.imu_frame is not None and self.imu is None:
             raise ValueError("imu_frame needs imu")
 

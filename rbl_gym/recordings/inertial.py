@@ -66,7 +66,7 @@ def read_inertial(
     if fastest > _MAX_RATE:
         raise ValueError(
             f"{table.path}: angular velocities of {fastest:.3g} rad/s are too large for a log in "
-            f"{turn_unit} (if it is in deg/s, set turn_unit='deg/s')"
+            f"{turn_unit} (are they in deg/s? set turn_unit to deg/s)"
         )
     usual = float(np.median(np.linalg.norm(readings[:, 3:], axis=-1))) / GRAVITY_M_S2
     if not _FORCE[0] < usual < _FORCE[1]:

@@ -82,12 +82,12 @@ def read_odometry(
     most = np.nan_to_num(np.abs(readings)).max(axis=0)
     if most[:3].max() > _MAX_RATE:
         raise ValueError(
-            f"{table.path}: turn rates of {most[:3].max():.3g} rad/s are too large (in deg/s, or "
-            "wheelbase in another unit?)"
+            f"{table.path}: turn rates of {most[:3].max():.3g} rad/s are too large (are they in "
+            "deg/s? set turn_unit to deg/s; or is wheelbase_m not in metres?)"
         )
     if most[3:].max() > _MAX_SPEED:
         raise ValueError(
-            f"{table.path}: speeds of {most[3:].max():.3g} m/s are too large (in millimetres?)"
+            f"{table.path}: speeds of {most[3:].max():.3g} m/s are too large (are they in mm/s?)"
         )
     return OdometryLog(times[later > 0], readings[later > 0])
 

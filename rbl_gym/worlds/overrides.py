@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import inspect
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rbl_gym.checks import check_one_of, did_you_mean
@@ -33,13 +34,9 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         If a field or kind is unknown, or a value is invalid.
     """
     fields = {entry.name for entry in dataclasses.fields(base)}
+    _check_fields(changes, fields, path)
     values = {}
     for key, value in changes.items():
-        if key not in fields:
-            raise ValueError(
-                f"{path} has no field {key!r}; its fields are {', '.join(sorted(fields))}"
-                f"{did_you_mean(key, fields)}"
-            )
         old = getattr(base, key)
         if key in _READ_BY_THEMSELVES:
             values[key] = value
@@ -53,6 +50,15 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         return dataclasses.replace(base, **values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _check_fields(given: Iterable[str], fields: Iterable[str], path: str) -> None:
+    for key in given:
+        if key not in fields:
+            raise ValueError(
+                f"{path} has no field {key!r}; its fields are {', '.join(sorted(fields))}"
+                f"{did_you_mean(key, fields)}"
+            )
 
 
 def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
@@ -69,7 +75,9 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
         raise ValueError(f"{path} has only one kind: leave out kind, got {value['kind']!r}")
     forms = NOISE_FORMS if kinds is NOISE_LAWS else kinds
     kind = forms[check_one_of(f"{path}.kind", value["kind"], list(forms))]
+    given = {key: item for key, item in value.items() if key != "kind"}
+    _check_fields(given, inspect.signature(kind).parameters, path)
     try:
-        return kind(**{key: item for key, item in value.items() if key != "kind"})
+        return kind(**given)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error

@@ -101,4 +101,4 @@ def _free_port(host: str, first: int) -> int:
                     raise ValueError(_FOREIGN.format(host)) from error
                 continue
             return probe.getsockname()[1]
-    raise ValueError(f"no port is free on {host!r} from {first} on")
+    raise ValueError(f"no port is free on {host!r} from {first}: choose another by --port")

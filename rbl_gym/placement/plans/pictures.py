@@ -98,4 +98,5 @@ def pixels(path: str) -> tuple[int, int]:
             with Image.open(file) as image:
                 return image.size
         except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
-            raise ValueError(f"{path}: not a picture: {error}") from error
+            why = "unknown format" if isinstance(error, UnidentifiedImageError) else error
+            raise ValueError(f"{path}: not a picture that can be read: {why}") from error

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbl_gym.checks import did_you_mean
 from rbl_gym.measurements.ranging import LinkModel
 from rbl_gym.recordings import Files, Recording, read_recording
 from rbl_gym.studies import replay
@@ -51,7 +52,8 @@ def load_recording(spec: Mapping[str, Any]) -> Log:
     unknown = [key for key in spec if key not in (*FILES, *SETTINGS)]
     if unknown:
         known = ", ".join((*FILES, *SETTINGS))
-        raise ValueError(f"a recording has no key {unknown[0]!r}; its keys are {known}")
+        near = did_you_mean(unknown[0], (*FILES, *SETTINGS))
+        raise ValueError(f"a recording has no key {unknown[0]!r}; its keys are {known}{near}")
     for key in FILES[:4]:
         if key not in spec:
             raise ValueError(f"a recording needs the key {key!r}, got {', '.join(spec)}")

@@ -57,8 +57,8 @@ def common_worlds(task: str, policies: Mapping[str, PolicyLike]) -> dict[str, An
     for label, other in others:
         if other != worlds:
             raise ValueError(
-                f"policies {first!r} and {label!r} were trained in different scenes: say by "
-                "--scene or --scenes in which to play"
+                f"policies {first!r} and {label!r} were trained in different scenes: choose "
+                "one by --scene or --scenes"
             )
     for label in found:
         files = policies[label].meta.get("files", {})
@@ -66,8 +66,8 @@ def common_worlds(task: str, policies: Mapping[str, PolicyLike]) -> dict[str, An
             state = "has changed since" if Path(path).is_file() else "is not here"
             if state == "is not here" or _digest(path) != digest:
                 raise ValueError(
-                    f"policy {label!r} was trained in a scene of {path}, which {state}: say by "
-                    "--scene or --scenes in which to play"
+                    f"policy {label!r} was trained in a scene of {path}, which {state}: choose "
+                    "a scene by --scene or --scenes"
                 )
     return worlds
 

@@ -168,7 +168,7 @@ def write_layout(
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"{path}: the name of a layout must end in {', '.join(SUFFIXES)}")
+        raise ValueError(f"{path}: the name of a layout must end in one of {', '.join(SUFFIXES)}")
     rows = mounting_list(problem, anchors, names)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     {".csv": _write_csv, ".geojson": _write_geojson, ".dxf": _write_dxf}[suffix](
