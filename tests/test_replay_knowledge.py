@@ -9,6 +9,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from rbl_gym.studies.replay.centre import about_origin
 from rbl_gym.studies.replay.observed import Observed, observed
 from rbl_gym.studies.replay.place import start_of
 
@@ -52,13 +53,57 @@ def test_one_tag_gives_a_place_and_says_so():
 def test_an_origin_far_from_the_line_of_the_tags_is_a_warning():
     """Half a metre around the unknown axis is no Gaussian error; level bodies have none of it."""
     recording = record(np.array([[0.0, 0.4, 0.5], [0.0, -0.4, 0.5]]))
-    (note,) = [one for one in outcome(recording).figures["notes"] if "do not determine" in one]
+    figures = outcome(recording).figures
+    (note,) = [one for one in figures["notes"] if "do not determine" in one]
+    assert len(figures["undetermined"]) == 1
+    assert figures["undetermined"][0].startswith("the rotation about the body's axis (")
     assert note.startswith("WARNING: ")
     assert "0.50 m away from the tags" in note
     assert "--tilt-std-deg" in note
     found = outcome(recording, tilt_std_deg=3.0).figures
     assert not any("do not determine" in one for one in found["notes"])
+    assert found["undetermined"] == []
     assert found["position_rmse_m"] < 0.2
+
+
+@pytest.mark.parametrize("filter", ["iekf", "iekf-log"])
+@pytest.mark.parametrize("tags", [[[0.3, 0.0, 0.2]], [[0.3, 0.2, 0.1], [-0.3, 0.2, 0.1]]])
+def test_no_information_is_made_up_about_a_rotation_that_the_ranges_leave_open(tags, filter):
+    tags = np.array(tags)
+    result = outcome(record(tags), filter=filter, walk_m=0.3, smooth=True)
+    for track, figures in (
+        (result.track, result.figures),
+        (result.smoothed.track, result.figures["smoothed"]),
+    ):
+        assert figures["anees"] < 2
+        assert figures["centre_rmse_m"] < 0.25
+        spread = np.sqrt(np.linalg.eigvalsh(track.covariance[:, :3, :3])[:, -1])
+        assert spread[5:].min() > 1.5
+        assert np.linalg.eigvalsh(track.covariance)[:, 0].min() > 0
+    with_start = outcome(record(tags), filter=filter, walk_m=0.3, start=(4.0, 2.5, 1.0))
+    assert with_start.figures["anees"] < 2
+
+
+@pytest.mark.parametrize("std", [0.05, 0.8, 3.0])
+def test_moments_of_an_origin_away_from_the_centre_of_the_tags(std):
+    """About one axis they are those of Gaussian angles; 5 standard deviations of the samples."""
+    rng = np.random.default_rng(3)
+    Q, centre = rotations.exp([0.3, -0.2, 0.5]), np.array([0.3, -0.1, 0.2])
+    axis = rotations.exp([0.4, 0.1, -0.3])[2]
+    P = 1e-8 * np.eye(6)
+    P[:3, :3] += std**2 * np.outer(axis, axis)
+    P[3:, 3:] += np.diag([0.1, 0.2, 0.3]) ** 2
+    poses = replay.Track(np.zeros(1), Q[None], np.ones((1, 3)), P[None])
+    moved = about_origin(poses, centre)
+    np.testing.assert_allclose(moved.translation[0], 1 - Q @ centre)
+    angle = std * rng.standard_normal(200_000)
+    w = angle[:, None] * axis
+    off = rng.standard_normal((len(w), 3)) * [0.1, 0.2, 0.3]
+    off = off + rotations.exp(w) @ (-Q @ centre) + Q @ centre
+    samples = np.concatenate([w, off], axis=1)
+    products = samples[:, :, None] * samples[:, None]
+    error = products.std(axis=0) / np.sqrt(len(w))
+    assert (np.abs(products.mean(axis=0) - moved.covariance[0]) < 5 * error + 1e-6).all()
 
 
 def test_two_tags_give_their_line():

@@ -15,8 +15,8 @@ __all__ = ["Observed", "observed"]
 
 # A direction is known if its standard deviation is below this rotation (rad) or position (m).
 _KNOWN_RAD, _KNOWN_M = 0.5, 1.0
-# Tags are collinear if the ratio of their squared thickness to squared length is below this.
-_THIN = 0.01
+# Above this standard deviation the direction of an axis may be any (deg).
+_ANY_DEG = 100.0
 
 
 class Observed(NamedTuple):
@@ -44,10 +44,12 @@ class Observed(NamedTuple):
 def observed(track: Track, tags: FloatArray) -> Observed:
     """Return the known directions of the beliefs (K,) of a track; tags (N, 3)."""
     Q, P = track.rotation, track.covariance
-    # Covariance at the tag centre: v + w x Q c.
-    T = np.broadcast_to(np.eye(6), P.shape).copy()
-    T[:, 3:, :3] = -rotations.hat(Q @ tags.mean(axis=0))
-    moved = T @ P @ np.swapaxes(T, -1, -2)
+    moved = track.at_centre
+    if moved is None:
+        # Covariance at the tag centre: v + w x Q c.
+        T = np.broadcast_to(np.eye(6), P.shape).copy()
+        T[:, 3:, :3] = -rotations.hat(Q @ tags.mean(axis=0))
+        moved = T @ P @ np.swapaxes(T, -1, -2)
     values, axes = np.linalg.eigh(np.swapaxes(Q, -1, -2) @ P[:, :3, :3] @ Q)
     turn = np.sqrt(np.maximum(values, 0.0))
     place = np.sqrt(np.maximum(np.linalg.eigvalsh(moved[:, 3:, 3:]), 0.0))
@@ -63,6 +65,7 @@ def known_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], l
     result: dict[str, Any] = {
         "known_directions": int(known[-1]),
         "known_directions_since_s": _since(known, times),
+        "undetermined": [],
     }
     notes = []
     if found.turns[-1] < 3:
@@ -72,25 +75,20 @@ def known_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], l
             f"the rotation, except that about the body's axis {_axis(found.turn_axes[-1, :, 0])}",
             f"the rotation about the body's axis {_axis(found.turn_axes[-1, :, 2])}",
         )[int(found.turns[-1])]
-        std = f"{spread.max():.0f} deg" if spread.max() < 180 else "above 180 deg"
+        result["undetermined"].append(what)
+        std = f"{spread.max():.0f} deg" if spread.max() < _ANY_DEG else None
         middle = recording.tags.mean(axis=0)
         if found.turns[-1] == 2:
             axis = found.turn_axes[-1, :, 2]
             middle = middle - (middle @ axis) * axis
         lever = float(np.linalg.norm(middle))
-        # On a circle of this radius the errors of the origin are not Gaussian.
         far = lever > found.place_std[-1].max()
         notes.append(_note(what, std, _since(found.turns, times), lever if far else None))
     if found.places[-1] < 3:
+        result["undetermined"].append("the position")
         spread = found.place_std[-1].max()
         notes.append(_note("the position", f"{spread:.3g} m", _since(found.places, times)))
     return result, notes
-
-
-def is_line(tags: FloatArray) -> bool:
-    """Return whether tags (N, 3) are one or nearly collinear: rotation about them is unknown."""
-    values = np.linalg.svd(tags - tags.mean(axis=0), compute_uv=False) ** 2
-    return len(tags) < 3 or bool(values[1] <= _THIN * values[0])
 
 
 def _since(count: np.ndarray, times: FloatArray) -> float:
@@ -104,18 +102,15 @@ def _axis(axis: FloatArray) -> str:
     return "(" + ", ".join(f"{x:.2f}" for x in axis + 0.0) + ")"
 
 
-def _note(what: str, std: str, since: float, lever_m: float | None = None) -> str:
+def _note(what: str, std: str | None, since: float, lever_m: float | None = None) -> str:
     """Return a note, a warning if the origin of the body is `lever_m` away from the tags."""
-    kind, end = "Note", "The covariance includes this."
-    if lever_m is not None:
-        kind = "WARNING"
-        end = (
-            f"The origin of the body is {lever_m:.2f} m away from the tags, so its position is "
-            "unknown by as much, and the covariance is too small. State what is known (--planar "
-            "with --height-m, or --tilt-std-deg), or give the tags relative to their centre."
-        )
     when = "since the start" if since == 0 else f"since {since:.1f} s after the start"
+    spread = "it may have any value" if std is None else f"its standard deviation is {std}"
+    text = f"the ranges do not determine {what} ({when}): {spread} at the end."
+    if lever_m is None:
+        return f"Note: {text} The covariance includes this."
     return (
-        f"{kind}: the ranges do not determine {what} ({when}): its standard deviation is {std} at "
-        f"the end. {end}"
+        f"WARNING: {text} The origin of the body is {lever_m:.2f} m away from the tags, so its "
+        "position is unknown by as much; the covariance includes this. State what is known "
+        "(--planar with --height-m, or --tilt-std-deg), or give the tags relative to their centre."
     )

@@ -17,7 +17,7 @@ __all__ = ["height_offset", "origin_of", "volume_of"]
 # Coordinates above this value are map coordinates.
 _MAP_M = 1e4
 # Default standard deviations of a known start, and of its yaw.
-_START_M, _START_DEG = 0.5, 30.0
+START_M, _START_DEG = 0.5, 30.0
 # Standard deviations of height (m), roll and pitch (rad) under the planar constraint.
 _PLANAR_STD = 1e-3
 # Anchors with heights within this margin are in one plane.
@@ -93,7 +93,7 @@ def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
         centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
     if known.start is not None:
         centre = np.array(known.start[:3])
-        std[3:] = _START_M if known.prior_position_m is None else known.prior_position_m
+        std[3:] = START_M if known.prior_position_m is None else known.prior_position_m
         if len(known.start) == 4:
             rotation = rotations.exp([0.0, 0.0, math.radians(known.start[3])])
             std[:3] = math.radians(_START_DEG)

@@ -20,6 +20,7 @@ from rbl_gym.motion.unknown_twist import WanderingTwist
 from rbl_gym.recordings.odometry import OdometryLog
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import stack_beliefs
+from rbl_gym.studies.replay.centre import about_origin, centred
 from rbl_gym.studies.replay.mirror import covering
 from rbl_gym.studies.replay.place import level_of, origin_of, own_std, start_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
@@ -80,6 +81,9 @@ def smooth_recording(recording: Recording, settings: Settings, track: Track) -> 
     """
     _check_size(recording, settings)
     began = time.process_time()
+    recording, settings, centre = centred(recording, settings)
+    if centre is not None:
+        track = about_origin(track, -centre)
     origin = origin_of(recording)
     local = recording._replace(anchors=recording.anchors - origin)
     rotation, translation, covariance = prior_of(recording, settings)
@@ -99,6 +103,8 @@ def smooth_recording(recording: Recording, settings: Settings, track: Track) -> 
     if track.other is not None:
         poses = (*poses[:2], covering(track.other, poses))
     smoothed = Track(recording.times, *poses, other=track.other)
+    if centre is not None:
+        smoothed = about_origin(smoothed, centre)._replace(at_centre=smoothed.covariance)
     return SmoothedRecording(smoothed, best, time.process_time() - began)
 
 

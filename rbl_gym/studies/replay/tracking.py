@@ -21,6 +21,7 @@ from rbl_gym.recordings.inertial import samples_between
 from rbl_gym.recordings.odometry import odometry_between
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import Reading, Step, innovations_of, stack_beliefs, track_epochs
+from rbl_gym.studies.replay.centre import about_origin, centred
 from rbl_gym.studies.replay.inertial import clocked, standing
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
 from rbl_gym.studies.replay.place import (
@@ -54,7 +55,8 @@ class Track(NamedTuple):
 
     `other`: the mirror pose if it explains the ranges too; the covariance then includes it.
     `innovations`: innovations of the ranges, arrays (K, ...). `nis` over `dof` is 1 on average if
-    the filter is consistent.
+    the filter is consistent. `at_centre`: covariances (K, 6, 6) with the errors of the centre of
+    the tags in place of those of the origin, if this centre was tracked (`replay.centre`).
     """
 
     times: FloatArray
@@ -63,6 +65,7 @@ class Track(NamedTuple):
     covariance: FloatArray
     other: Mirror | None = None
     innovations: Innovations | None = None
+    at_centre: FloatArray | None = None
 
 
 def track_recording(
@@ -71,7 +74,16 @@ def track_recording(
     """Filter a recording causally, epoch by epoch; `advance` is called after each.
 
     If a mirror pose explains the ranges equally well, the belief includes both (`replay.mirror`).
+    A rotation that the ranges do not determine keeps a large variance (`replay.centre`).
     """
+    recording, settings, centre = centred(recording, settings)
+    track = _tracked(recording, settings, advance)
+    if centre is None:
+        return track
+    return about_origin(track, centre)._replace(at_centre=track.covariance)
+
+
+def _tracked(recording: Recording, settings: Settings, advance: Callable[[], None]) -> Track:
     filter = recording_filter(recording, settings)
     beliefs, found = [], []
     steps = recording_steps(recording, settings, filter)
