@@ -350,6 +350,20 @@ def test_coplanar_tags_have_a_mirror_pose_and_both_are_reported(anchors):
         rotations.check_rotation("rotation", rotation)
 
 
+def test_a_body_near_the_plane_of_its_anchors_has_a_mirror_pose():
+    """Gauss-Newton is slow here. Of 200 trials, 91 to 94 % have one; this scatters by 2 %."""
+    anchors = np.array([[5, 0, 0], [-5, 0, 0], [0, 5, 0], [0, -5, 0], [4, 4, 0]], float)
+    tags, rotation = bodies.octahedron(0.8)[[0, 1, 3, 4]], rotations.exp([0.1, 0.2, 0.3])
+    place, noise = np.tile([0.5, 0.2, 1.0], (200, 1)), ranging.RangeNoise(0.1)
+    rng = np.random.default_rng(1)
+    ranges = ranging.simulate(anchors, tags, rotation, place, noise, rng).ranges
+    found = estimators.locate(ranges, anchors, tags, noise)
+    image = found.translation * [1, 1, -1]
+    gap = np.linalg.norm(found.alternatives.translation - image[:, None], axis=-1)
+    near = np.isfinite(found.alternatives.cost) & (gap < 0.05)
+    assert near.any(axis=1).mean() > 0.85
+
+
 def test_solid_tags_tell_the_side_of_a_plane_of_anchors():
     found = exact(FLAT, bodies.pyramid(1.5))
     np.testing.assert_allclose(found.rotation, POSE[0], atol=1e-6)

@@ -221,7 +221,7 @@ def local_minima(
     # Distinct minima first, in their order.
     keep = np.argsort(~distinct, axis=-1, kind="stable")[:, :_MINIMA]
     kept = _rows(coarse, keep)
-    fine = minimize(part, kept.rotation, kept.translation, 25)
+    fine = minimize(part, kept.rotation, kept.translation, 100, 1e-4)
     there = np.take_along_axis(distinct, keep, axis=-1)
     at = fine.at._replace(cost=np.where(there, fine.at.cost, np.inf))
     fine = fine._replace(at=at, converged=fine.converged & there)

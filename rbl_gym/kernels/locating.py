@@ -319,7 +319,7 @@ def search(
             if stage == 0 or counted[s]:
                 costs[s], good[s] = solve(
                     Qs[s], ts[s], False, Q, t, H, ranges, weights, anchors, tags, loss, 0,
-                    25 if stage else 10, 1e-6 if stage else 1e-2, g, H,
+                    100 if stage else 10, 1e-4 if stage else 1e-2, g, H,
                 )  # fmt: skip
             else:
                 costs[s] = math.inf
