@@ -8,8 +8,10 @@
   other solutions.
 
 The peers get their models ready-made, whitened matrices or a factor graph, and start from our
-start; ours start from ranges. The results are checked equal first. Process time, one thread,
-medians over interleaved repeats. A peer that is not installed is skipped: pip install '.[peers]'.
+start; ours start from ranges. simdkalman starts from ranges too, which one matrix product whitens
+and compresses for it; in the rows "ready" it gets the result of that. The results are checked equal
+first. Process time, one thread, medians over interleaved repeats. A peer that is not installed is
+skipped: pip install '.[peers]'.
 
     python benchmarks/peers.py [--json F] [--repeats 7] [--seed 0]
 """
@@ -138,22 +140,30 @@ class Tracks:
         shift = np.concatenate([np.zeros(9), self.twist[3:] * DT])
         return transition(rotations.exp(self.twist[:3] * DT)), noise, shift
 
-    def measurements(self, *, short: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened H and z of all steps (STEPS, trials, rows), ``|s|^2`` projected out.
+    def model(self, *, short: bool) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Whitened H, and a function from ranges (trials, M, N) to z (trials, rows).
 
-        Rows of the papers, (M - 1) N, or the twelve that tell as much where `short`.
+        ``|s|^2`` is projected out. Rows of the papers, (M - 1) N, or the twelve that tell as much
+        where `short`. One matrix product gives z of all trials.
         """
+        m, n = len(self.anchors), len(self.tags)
         root = np.sqrt(self.weights)
         basis = np.linalg.svd(root[:, None])[0][:, 1:]
         rows = basis.T @ (root[:, None] * (-2 * self.anchors))
-        extended = np.concatenate([self.tags, np.ones((len(self.tags), 1))], axis=1)
+        extended = np.concatenate([self.tags, np.ones((n, 1))], axis=1)
         H = np.kron(extended, rows)
-        d = np.array(self.ranges) ** 2 - (self.anchors**2).sum(axis=1)[:, None]
-        z = np.swapaxes(basis.T @ (root[:, None] * d), -1, -2).reshape(*d.shape[:2], -1)
-        if not short:
-            return H, z
-        Q, R = np.linalg.qr(H)
-        return R, z @ Q
+        # Column m N + n: the effect of link (m, n).
+        whitened = np.kron(np.eye(n), basis.T * root).reshape(-1, n, m)
+        whitened = np.swapaxes(whitened, -1, -2).reshape(-1, m * n).T
+        if short:
+            Q, H = np.linalg.qr(H)
+            whitened = whitened @ Q
+        squares = (self.anchors**2).sum(axis=1)[:, None]
+
+        def measured(ranges: np.ndarray) -> np.ndarray:
+            return (ranges**2 - squares).reshape(len(ranges), -1) @ whitened
+
+        return H, measured
 
 
 def against_simdkalman(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
@@ -163,16 +173,18 @@ def against_simdkalman(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
     tracks = Tracks(rng, m, n, TRIALS)
     F, noise, shift = tracks.transition()
 
-    def duel(*, short: bool) -> Duel:
-        H, z = tracks.measurements(short=short)
+    def duel(*, short: bool, ready: bool) -> Duel:
+        H, measured = tracks.model(short=short)
         unit = np.eye(len(H))
+        known = [measured(ranges) for ranges in tracks.ranges]
 
         def peer() -> tuple[np.ndarray, np.ndarray]:
             mean, P = tracks.prior.mean[..., None], tracks.prior.covariance[None]
-            for values in z:
+            for k, ranges in enumerate(tracks.ranges):
+                z = known[k] if ready else measured(ranges)
                 mean, P = primitives.predict(mean, P, F, noise)
                 mean = mean + shift[:, None]
-                mean, P = primitives.update(mean, P, H, unit, values[..., None])
+                mean, P = primitives.update(mean, P, H, unit, z[..., None])
             return mean[..., 0], P
 
         def check() -> None:
@@ -183,13 +195,13 @@ def against_simdkalman(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
 
         count = TRIALS * STEPS
         return Duel(
-            f"simdkalman, {len(H)} rows",
+            f"simdkalman, {len(H)} rows{' ready' if ready else ''}",
             side_by_side.Job(peer, count),
             {"kf, shared covariance": side_by_side.Job(lambda: tracks.ours(slice(None)), count)},
             check,
         )
 
-    return [duel(short=False), duel(short=True)]
+    return [duel(short=short, ready=ready) for ready in (False, True) for short in (False, True)]
 
 
 def against_stonesoup(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
@@ -205,7 +217,8 @@ def against_stonesoup(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
 
     tracks = Tracks(rng, m, n, TRIALS)
     F, noise, shift = tracks.transition()
-    H, z = tracks.measurements(short=True)
+    H, measured = tracks.model(short=True)
+    z = np.array([measured(ranges) for ranges in tracks.ranges])
 
     class Compressed(LinearGaussian):
         """The twelve rows: stonesoup's own model only selects states."""

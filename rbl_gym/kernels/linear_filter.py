@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.kernels import rotations
-from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.jit import gufunc, helper, inlined
 from rbl_gym.kernels.linear_algebra import factor_semidefinite, fill, of_size
 from rbl_gym.kernels.workspace import workspace, zeros
 
@@ -143,7 +143,7 @@ def _add_information(H: Any, anchors: Any, tags: Any, weights: Any) -> None:
                 H[i + 1, j + 2] += yz
 
 
-@helper
+@inlined
 def innovation(
     mean: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, arms: Any, y: Any
 ) -> None:
@@ -166,15 +166,19 @@ def innovation(
         if weights.shape[1] > 1:
             column = n
             x0, x1, x2 = _weighted_mean(anchors, weights, n)
-        b0 = b1 = b2 = 0.0
+        b0 = b1 = b2 = total = 0.0
         for m in range(anchors.shape[0]):
-            a0, a1, a2 = anchors[m, 0], anchors[m, 1], anchors[m, 2]
-            d0, d1, d2 = a0 - s0, a1 - s1, a2 - s2
+            d0, d1, d2 = anchors[m, 0] - s0, anchors[m, 1] - s1, anchors[m, 2] - s2
             r = ranges[m, n]
-            e = -2 * weights[m, column] * (r * r - (d0 * d0 + d1 * d1 + d2 * d2))
-            b0 += e * (a0 - x0)
-            b1 += e * (a1 - x1)
-            b2 += e * (a2 - x2)
+            e = weights[m, column] * (d0 * d0 + d1 * d1 + d2 * d2 - r * r)
+            total += e
+            b0 += e * d0
+            b1 += e * d1
+            b2 += e * d2
+        # Less the part of the mean, for a_m - a in place of a_m - s.
+        b0 = 2 * (b0 - total * (x0 - s0))
+        b1 = 2 * (b1 - total * (x1 - s1))
+        b2 = 2 * (b2 - total * (x2 - s2))
         for k in range(4):
             c = arms[n, k] if k < 3 else 1.0
             y[k, 0] += c * b0
@@ -213,12 +217,16 @@ def _take_mean(
 ) -> None:
     y = workspace((4, 3))
     innovation(mean, ranges, anchors, tags, weights, tags, y)
+    x = workspace((_STATES,))
     for i in range(_STATES):
-        total = mean[i]
-        for k in range(4):
-            for j in range(3):
-                total += P[i, 3 * k + j] * y[k, j]
-        new_mean[i] = total
+        x[i] = mean[i]
+    for k in range(4):
+        for j in range(3):
+            # By rows of the symmetric P: 12 sums at once.
+            for i in range(_STATES):
+                x[i] += P[3 * k + j, i] * y[k, j]
+    for i in range(_STATES):
+        new_mean[i] = x[i]
 
 
 @gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p)")
