@@ -1,6 +1,8 @@
-"""Recordings of simulated bodies, for tests of replay."""
+"""Recordings of simulated bodies, for tests of replay, and their files."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 
@@ -58,3 +60,35 @@ def honest_track(truth, times, tags, seed=0):
     links = np.ones((len(times), len(CORNERS), len(tags)), bool)
     ids = tuple("abcd"), tuple(map(str, range(len(tags))))
     return Recording(times, 5.0 * links, links, None, CORNERS, tags, *ids, truth), track
+
+
+def table(path: Path, header: str, rows) -> str:
+    """The path of a file of CSV with these rows; what is NaN has no text."""
+    texts = (",".join("" if cell != cell else str(cell) for cell in row) for row in rows)
+    path.write_text("\n".join([header, *texts, ""]), encoding="utf-8")
+    return str(path)
+
+
+def points(path: Path, name: str, places) -> str:
+    """A file of these places, called 0, 1, ..."""
+    return table(path, f"{name},x,y,z", ([i, *place] for i, place in enumerate(places)))
+
+
+def files(folder: Path, anchors, tags, times, ranges, truth=None) -> dict[str, str]:
+    """Files of ranges (K, M, N), points and poses, by the names of their options."""
+    pairs = np.ndindex(ranges.shape[1:])
+    header = ",".join(["t", *(f"a{m}t{n}" for m, n in pairs)])
+    written = {
+        "ranges": table(folder / "ranges.csv", header, np.c_[times, ranges.reshape(len(times), -1)])
+    }
+    for name, places in (("anchor", anchors), ("tag", tags)):
+        written[f"{name}s"] = points(folder / f"{name}s.csv", name, places)
+    if truth is not None:
+        rows = np.c_[times, truth[1], rotations.quaternion(truth[0])]
+        written["truth"] = table(folder / "truth.csv", "t,x,y,z,qw,qx,qy,qz", rows)
+    return written
+
+
+def options(files: dict) -> list[str]:
+    """What tells a command of these files."""
+    return [part for name, path in files.items() for part in (f"--{name}", str(path))]

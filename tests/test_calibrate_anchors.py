@@ -18,6 +18,7 @@ from rbl_gym.estimators.calibration.survey_start import (
 from rbl_gym.recordings import Files, Recording, align_positions, apply_alignment, read_recording
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import AnchorSettings, SurveyedAnchors
+from tests import recorded
 from tests.helpers import ROOT
 
 LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
@@ -179,19 +180,13 @@ def test_what_cannot_be_surveyed_is_refused():
 def test_the_command_writes_anchors_that_replay_reads(tmp_path, capsys):
     rng = np.random.default_rng(7)
     ranges, _, _ = simulate(rng, HALL, TAGS, 80, bias=0.2)
-    names = [f"a{m}t{n}" for m in range(7) for n in range(3)]
-    table = np.column_stack([0.5 * np.arange(80), ranges.reshape(80, -1)])
-    files = {name: str(tmp_path / f"{name}.csv") for name in ("ranges", "anchors", "tags")}
-    header = ",".join(["t", *names])
-    np.savetxt(files["ranges"], table, "%.9f", ",", header=header, comments="")
     rough = HALL + 0.2 * rng.standard_normal(HALL.shape) * [1, 1, 0]
-    calibrate.write_points(files["anchors"], "anchor", "0123456", rough)
-    calibrate.write_points(files["tags"], "tag", "012", TAGS)
+    files = recorded.files(tmp_path, rough, TAGS, 0.5 * np.arange(80), ranges)
     pairs = tmp_path / "pairs.csv"
     apart = np.linalg.norm(HALL[0] - HALL[3])
     pairs.write_text(f"anchor_a,anchor_b,range\n0,3,{apart + 0.2}\n0,3,{apart + 0.2}\n")
     out, plot = tmp_path / "out", tmp_path / "anchors.png"
-    arguments = ["calibrate", *(part for n, f in files.items() for part in (f"--{n}", f))]
+    arguments = ["calibrate", *recorded.options(files)]
     arguments += ["--planar", "--height-offset-m", "0.3", "--anchor-ranges", str(pairs)]
     assert main([*arguments, "--out", str(out), "--plot", str(plot)]) == 0
     said = capsys.readouterr().out

@@ -21,6 +21,7 @@ from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.recordings import InertialLog, Truth, read_directions
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import LinkSettings
+from tests import recorded
 from tests.helpers import with_kernels
 from tests.test_calibrate_links import ANCHORS, TAGS, path_of, ranges_of, recording_of
 
@@ -118,17 +119,8 @@ def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     rng = np.random.default_rng(4)
     law = pattern(rng)
     ranges, rotation, place = with_pattern(rng, law, noise=0.02)
-    names = [f"a{m}t{n}" for m in range(6) for n in range(4)]
-    files = {name: str(tmp_path / f"{name}.csv") for name in ("ranges", "truth", "anchors", "tags")}
-    quaternion = Rotation.from_matrix(rotation).as_quat()
-    for name, header, values in (
-        ("ranges", ",".join(["t", *names]), np.column_stack([TIMES, ranges.reshape(400, -1)])),
-        ("truth", "t,x,y,z,qx,qy,qz,qw", np.column_stack([TIMES, place, quaternion])),
-    ):
-        np.savetxt(files[name], values, "%.9f", ",", header=header, comments="")
-    calibrate.write_points(files["anchors"], "anchor", "012345", ANCHORS)
-    calibrate.write_points(files["tags"], "tag", "0123", TAGS)
-    logs = [part for name, file in files.items() for part in (f"--{name}", file)]
+    files = recorded.files(tmp_path, ANCHORS, TAGS, TIMES, ranges, (rotation, place))
+    logs = recorded.options(files)
     out, plot = tmp_path / "out", tmp_path / "links.png"
     how = ["--planar", "--arms", "held", "--harmonics", "3", "--time-offset", "0"]
     assert main(["calibrate", *logs, *how, "--out", str(out), "--plot", str(plot)]) == 0

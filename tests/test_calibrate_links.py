@@ -22,6 +22,7 @@ from rbl_gym.estimators.calibration.drift import NO_DRIFT, Drift, Whitener, find
 from rbl_gym.recordings import Files, Recording, Truth, read_recording
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import CalibratedLinks, LinkSettings
+from tests import recorded
 from tests.helpers import ROOT
 
 LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
@@ -263,17 +264,8 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
     rng = np.random.default_rng(4)
     bias = rng.normal(0.2, 0.1, (6, 4))
     ranges = ranges_of(times, rng, bias=bias, noise=0.02)
-    rotation, place = path_of(times)
-    names = [f"a{m}t{n}" for m in range(6) for n in range(4)]
-    table = np.column_stack([times, ranges.reshape(150, -1)])
-    header = {"ranges": ",".join(["t", *names]), "truth": "t,x,y,z,qx,qy,qz,qw"}
-    poses = np.column_stack([times, place, Rotation.from_matrix(rotation).as_quat()])
-    files = {name: str(tmp_path / f"{name}.csv") for name in ("ranges", "truth", "anchors", "tags")}
-    for name, values in (("ranges", table), ("truth", poses)):
-        np.savetxt(files[name], values, "%.9f", ",", header=header[name], comments="")
-    calibrate.write_points(files["anchors"], "anchor", "012345", ANCHORS)
-    calibrate.write_points(files["tags"], "tag", "0123", TAGS)
-    arguments = [part for name, file in files.items() for part in (f"--{name}", file)]
+    files = recorded.files(tmp_path, ANCHORS, TAGS, times, ranges, path_of(times))
+    arguments = recorded.options(files)
     out = tmp_path / "out"
     plot = tmp_path / "links.png"
     assert main(["calibrate", *arguments, "--out", str(out), "--plot", str(plot)]) == 0

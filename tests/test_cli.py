@@ -19,7 +19,9 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import replay
 from rbl_gym.studies.papers import camsap2013
+from tests import recorded
 from tests.helpers import ROOT, Told, assert_table_holds, with_kernels
+from tests.recorded import table
 
 LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
 
@@ -108,14 +110,6 @@ def test_only_the_iterated_ekf_reaches_the_bound(experiment):
     assert 1.05 < ratios["UC-KF"][0] < 1.2 < ratios["KF-ortho"][0] < ratios["ET-KF"][0]
 
 
-def write(path: Path, header: list[str], rows) -> str:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(rows)
-    return str(path)
-
-
 @pytest.fixture
 def files(tmp_path):
     """A body turning and flying through a room for 20 s, 3-D, with its truth."""
@@ -127,24 +121,12 @@ def files(tmp_path):
     ranges = ranging.simulate(
         anchors, tags, path.rotation, path.translation, ranging.RangeNoise(0.03), rng
     ).ranges
-    times = 0.2 * np.arange(101)
-    q = rotations.quaternion(path.rotation)
-    names = [f"a{a}t{t}" for a in range(6) for t in range(6)]
-    rows = [[t, *r.ravel()] for t, r in zip(times, ranges, strict=True)]
-    rows[7][5] = ""
-    return {
-        "ranges": write(tmp_path / "ranges.csv", ["t", *names], rows),
-        "anchors": write(tmp_path / "anchors.csv", ["anchor", "x", "y", "z"],
-                         [[i, *a] for i, a in enumerate(anchors)]),
-        "tags": write(tmp_path / "tags.csv", ["tag", "x", "y", "z"],
-                      [[i, *c] for i, c in enumerate(tags)]),
-        "truth": write(tmp_path / "truth.csv", ["t", "x", "y", "z", "qw", "qx", "qy", "qz"],
-                       np.column_stack([times, path.translation, q])),
-    }  # fmt: skip
+    ranges[7, 0, 4] = np.nan
+    return recorded.files(tmp_path, anchors, tags, 0.2 * np.arange(101), ranges, path)
 
 
 def arguments(files):
-    return ["replay", *(part for name, path in files.items() for part in (f"--{name}", path))]
+    return ["replay", *recorded.options(files)]
 
 
 @pytest.mark.parametrize("name", ["iekf", "iekf-cv", "iekf-bias", "uc-kf", "kf-ortho"])
@@ -217,19 +199,10 @@ def raw_files(tmp_path):
     noise = ranging.RangeNoise(0.03)
     ranges = ranging.simulate(anchors, tags, *path, noise, rng).ranges
     ranges = ranges + 0.17 + 0.06 * rng.standard_normal((8, 3))
-    names = [f"a{a}t{t}" for a in range(8) for t in range(3)]
     times = 0.1 * np.arange(151)
-    yaw = np.rad2deg(rotations.yaw(path.rotation))
-    return {
-        "ranges": write(tmp_path / "ranges.csv", ["t", *names],
-                        [[t, *r.ravel()] for t, r in zip(times, ranges, strict=True)]),
-        "anchors": write(tmp_path / "anchors.csv", ["anchor", "x", "y", "z"],
-                         [[i, *a] for i, a in enumerate(anchors)]),
-        "tags": write(tmp_path / "tags.csv", ["tag", "x", "y", "z"],
-                      [[i, *c] for i, c in enumerate(tags)]),
-        "truth": write(tmp_path / "truth.csv", ["t", "x", "y", "z", "yaw_deg"],
-                       np.column_stack([times, path.translation, yaw])),
-    }  # fmt: skip
+    poses = np.column_stack([times, path.translation, np.rad2deg(rotations.yaw(path.rotation))])
+    files = recorded.files(tmp_path, anchors, tags, times, ranges)
+    return files | {"truth": table(tmp_path / "truth.csv", "t,x,y,z,yaw_deg", poses)}
 
 
 @with_kernels
@@ -308,10 +281,10 @@ def test_static_runs_of_a_real_recording(every, tmp_path):
         ends = [[cells[k][0], *place] for k in (0, -1)]
         recording = recordings.read_recording(
             recordings.Files(
-                write(tmp_path / "ranges.csv", header[1:], cells[::every]),
+                table(tmp_path / "ranges.csv", ",".join(header[1:]), cells[::every]),
                 LIAS / "anchors_8_14.csv",
                 LIAS / "tags_8_14.csv",
-                write(tmp_path / "truth.csv", ["t", "x", "y", "yaw_deg"], ends),
+                table(tmp_path / "truth.csv", "t,x,y,yaw_deg", ends),
                 LIAS / "calibration_8_14.csv",
             )
         )
@@ -332,13 +305,12 @@ def test_replay_says_which_deviation_of_a_range_it_took(files, capsys):
         return json.loads(capsys.readouterr().out)["settings"]
 
     assert settings()["range_std_m"] == 0.12
-    rows = [["t", "anchor", "tag", "range", "std"]]
     header, first, *_ = csv.reader(Path(files["ranges"]).read_text().splitlines())
-    rows += [
+    rows = [
         [first[0], *name[1:].split("t"), r, 0.05]
         for name, r in zip(header[1:], first[1:], strict=True)
     ]
-    Path(files["ranges"]).write_text("\n".join(",".join(map(str, row)) for row in rows))
+    table(Path(files["ranges"]), "t,anchor,tag,range,std", rows)
     assert settings()["range_std_m"] == "recorded"
     blind = "--filter", "tests.test_cli:blind"
     assert main([*arguments(files), *blind]) == 2
@@ -400,7 +372,7 @@ def test_a_planar_recording_refuses_the_linear_filters_with_their_rank(files, tm
     rows = [
         [i, x, y, 0] for i, (x, y) in enumerate([(0, 0), (8, 0), (8, 8), (0, 8), (4, 0), (4, 8)])
     ]
-    files["anchors"] = write(tmp_path / "flat.csv", ["anchor", "x", "y", "z"], rows)
+    files["anchors"] = table(tmp_path / "flat.csv", "anchor,x,y,z", rows)
     assert main([*arguments(files), "--filter", "kf"]) == 2
     assert "rank 8 of the filter's 12 states" in capsys.readouterr().err
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from rbl_gym import recordings
 from rbl_gym.app.cli import main
@@ -15,6 +14,7 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.recordings import differences
 from rbl_gym.studies import replay
+from tests.recorded import options, points, table
 
 M, N = 6, 4
 STD = 0.05
@@ -34,16 +34,10 @@ def walk(K: int = 60, seed: int = 0):
     return t, rotation, place, far + STD * rng.standard_normal(far.shape), rng
 
 
-def write(folder, name: str, header: str, rows) -> str:
-    path = folder / name
-    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
-    return str(path)
-
-
 def tables(folder) -> dict[str, Any]:
     return {
-        "anchors": write(folder, "a.csv", "anchor,x,y,z", ([i, *p] for i, p in enumerate(ANCHORS))),
-        "tags": write(folder, "b.csv", "tag,x,y,z", ([i, *p] for i, p in enumerate(TAGS))),
+        "anchors": points(folder / "a.csv", "anchor", ANCHORS),
+        "tags": points(folder / "b.csv", "tag", TAGS),
     }
 
 
@@ -65,7 +59,7 @@ ALL = [(a, b) for a in range(M) for b in range(a)]
 @pytest.mark.parametrize("pairs", [REFERENCE, CHAIN, ALL], ids=["reference", "chain", "all"])
 def test_differences_are_pseudo_ranges_with_the_noise_of_arrivals(tmp_path, pairs):
     t, _, _, arrivals, _ = walk(5)
-    path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, pairs))
+    path = table(tmp_path / "r.csv", HEADER, difference_rows(t, arrivals, pairs))
     log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.offset == "tag"
     assert log.links.all()
@@ -79,7 +73,7 @@ def test_differences_are_pseudo_ranges_with_the_noise_of_arrivals(tmp_path, pair
 def test_anchors_that_hang_together_with_no_other_are_left_out(tmp_path):
     t, _, _, arrivals, _ = walk(3)
     pairs = [(1, 0), (2, 1), (3, 2), (5, 4)]
-    path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, pairs))
+    path = table(tmp_path / "r.csv", HEADER, difference_rows(t, arrivals, pairs))
     log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.links[:, :4].all()
     assert not log.links[:, 4:].any()
@@ -89,7 +83,7 @@ def test_anchors_that_hang_together_with_no_other_are_left_out(tmp_path):
 def test_a_deviation_of_a_difference_is_that_of_two_arrivals(tmp_path):
     t, _, _, arrivals, _ = walk(3)
     rows = [[*row, 0.1] for row in difference_rows(t, arrivals, REFERENCE)]
-    path = write(tmp_path, "r.csv", HEADER + ",std", rows)
+    path = table(tmp_path / "r.csv", HEADER + ",std", rows)
     log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.range_std is not None
     np.testing.assert_allclose(log.range_std, 0.1 / np.sqrt(2))
@@ -104,7 +98,7 @@ def test_pseudo_ranges_of_any_sign_are_read(tmp_path, offset):
         [f"{time:.3f}", m, n, f"{told[k, m, n]:.9f}"]
         for k, time in enumerate(t) for m in range(M) for n in range(N)
     ]  # fmt: skip
-    path = write(tmp_path, "r.csv", "t,anchor,tag,range", rows)
+    path = table(tmp_path / "r.csv", "t,anchor,tag,range", rows)
     format = recordings.Format(offset=offset)
     log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)), format=format)
     assert log.offset == offset
@@ -136,7 +130,7 @@ def test_bad_rows_are_refused_by_line(tmp_path, row, column, cell, message):
     rows = difference_rows(t, arrivals, REFERENCE)
     assert rows[row][1] == 3
     rows[row][column] = cell
-    path = write(tmp_path, "r.csv", HEADER, rows)
+    path = table(tmp_path / "r.csv", HEADER, rows)
     format = recordings.Format(strict=True)
     with pytest.raises(ValueError, match=message) as caught:
         recordings.read_recording(recordings.Files(path, **tables(tmp_path)), format=format)
@@ -147,7 +141,7 @@ def test_a_pair_that_comes_twice_is_dropped_and_counted(tmp_path):
     t, _, _, arrivals, _ = walk(10)
     rows = difference_rows(t, arrivals, REFERENCE)
     rows.insert(1, [rows[0][0], rows[0][2], rows[0][1], rows[0][3], "1.0"])
-    path = write(tmp_path, "r.csv", HEADER, rows)
+    path = table(tmp_path / "r.csv", HEADER, rows)
     log = recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
     assert log.report.dropped["twice with two values"] == 1
 
@@ -162,10 +156,10 @@ def test_a_pair_that_comes_twice_is_dropped_and_counted(tmp_path):
 )  # fmt: skip
 def test_what_does_not_go_with_differences_is_refused(tmp_path, change, message):
     t, _, _, arrivals, _ = walk(3)
-    path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, REFERENCE))
+    path = table(tmp_path / "r.csv", HEADER, difference_rows(t, arrivals, REFERENCE))
     change = dict(change)
     if "calibration" in change:
-        change = {"calibration": write(tmp_path, "c.csv", "anchor,tag,bias_m", [[0, 0, 0.1]])}
+        change = {"calibration": table(tmp_path / "c.csv", "anchor,tag,bias_m", [[0, 0, 0.1]])}
     format = recordings.Format(offset=change.pop("offset", None))
     files = recordings.Files(path, **{**tables(tmp_path), **change})
     with pytest.raises(ValueError, match=message):
@@ -174,13 +168,13 @@ def test_what_does_not_go_with_differences_is_refused(tmp_path, change, message)
 
 def test_differences_longer_than_their_anchors_are_apart_are_refused(tmp_path):
     t, _, _, arrivals, _ = walk(5)
-    path = write(tmp_path, "r.csv", HEADER, difference_rows(t, 100 * arrivals, REFERENCE))
+    path = table(tmp_path / "r.csv", HEADER, difference_rows(t, 100 * arrivals, REFERENCE))
     with pytest.raises(ValueError, match="units look inconsistent"):
         recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
 
 
 def test_missing_columns_are_named(tmp_path):
-    path = write(tmp_path, "r.csv", "t,anchor_a,tag,difference", [[0, 0, 0, 1.0]])
+    path = table(tmp_path / "r.csv", "t,anchor_a,tag,difference", [[0, 0, 0, 1.0]])
     with pytest.raises(ValueError, match="anchor_b"):
         recordings.read_recording(recordings.Files(path, **tables(tmp_path)))
 
@@ -193,12 +187,9 @@ def test_the_larger_part_of_a_graph():
 @pytest.mark.parametrize("name", ["iekf", "iekf-cv", "iekf-log"])
 def test_differences_are_replayed_and_smoothed(tmp_path, name):
     t, rotation, place, arrivals, _ = walk(80)
-    path = write(tmp_path, "r.csv", HEADER, difference_rows(t, arrivals, REFERENCE))
-    quaternions = np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=-1)
-    truth = write(
-        tmp_path, "truth.csv", "t,x,y,z,qw,qx,qy,qz",
-        np.column_stack([t, place, quaternions]).tolist(),
-    )  # fmt: skip
+    path = table(tmp_path / "r.csv", HEADER, difference_rows(t, arrivals, REFERENCE))
+    poses = np.column_stack([t, place, rotations.quaternion(rotation)])
+    truth = table(tmp_path / "truth.csv", "t,x,y,z,qw,qx,qy,qz", poses)
     log = recordings.read_recording(recordings.Files(path, **tables(tmp_path), truth=truth))
     settings = replay.Settings.of(
         filter=name, range_std_m=STD, constant_std_m=1e-3, constant_common_m=0.0,
@@ -222,8 +213,8 @@ def test_the_command_replays_pseudo_ranges(tmp_path, capsys):
         [f"{time:.3f}", m, n, f"{told[k, m, n]:.9f}"]
         for k, time in enumerate(t) for m in range(M) for n in range(N)
     ]  # fmt: skip
-    path = write(tmp_path, "r.csv", "t,anchor,tag,range", rows)
-    files = [part for key, value in tables(tmp_path).items() for part in (f"--{key}", value)]
+    path = table(tmp_path / "r.csv", "t,anchor,tag,range", rows)
+    files = options(tables(tmp_path))
     arguments = ["replay", "--ranges", path, *files, "--filter", "iekf", "--json", "-"]
     assert main([*arguments, "--offset", "tag"]) == 0
     figures = json.loads(capsys.readouterr().out)

@@ -19,6 +19,7 @@ from rbl_gym.measurements import inertial
 from rbl_gym.motion import smooth
 from rbl_gym.recordings import InertialLog, Recording, read_frame
 from rbl_gym.studies import replay
+from tests import recorded
 
 ANCHORS = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
 TAGS = np.array([[0.1, 0.1, 0.0], [0.1, -0.1, 0.0]])
@@ -134,24 +135,13 @@ def test_axes_and_clock_of_an_imu_on_the_command_line(tmp_path, capsys):
     Q, p = pose(times)
     ends = p[:, None] + np.einsum("kij,nj->kni", Q, TAGS)
 
-    def write(name, header, rows):
-        np.savetxt(tmp_path / name, rows, delimiter=",", header=header, comments="", fmt="%.7f")
-        return str(tmp_path / name)
-
     anchor, tag = rng.integers(0, 6, len(times)), rng.integers(0, 2, len(times))
     distance = np.linalg.norm(ends[np.arange(len(times)), tag] - ANCHORS[anchor], axis=1)
-    rows = np.column_stack([times, anchor, tag, distance + 0.02 * rng.standard_normal(len(times))])
-    files = {
-        "ranges": write("ranges.csv", "t,anchor,tag,range", rows),
-        "anchors": write("anchors.csv", "anchor,x,y,z", np.column_stack([np.arange(6), ANCHORS])),
-        "tags": write("tags.csv", "tag,x,y,z", np.column_stack([np.arange(2), TAGS])),
-        "truth": write(
-            "truth.csv", "t,x,y,z,qw,qx,qy,qz", np.column_stack([times, p, rotations.quaternion(Q)])
-        ),
-        "imu": write(
-            "imu.csv", "t,wx,wy,wz,ax,ay,az", np.column_stack([when[: len(read)] + 0.7, read])
-        ),
-    }
+    ranges = np.full((len(times), 6, 2), np.nan)
+    ranges[np.arange(len(times)), anchor, tag] = distance + 0.02 * rng.standard_normal(len(times))
+    files = recorded.files(tmp_path, ANCHORS, TAGS, times, ranges, (Q, p))
+    rows = np.column_stack([when[: len(read)] + 0.7, read])
+    files["imu"] = recorded.table(tmp_path / "imu.csv", "t,wx,wy,wz,ax,ay,az", rows)
     told = [f"--{name}={path}" for name, path in files.items()]
     out = tmp_path / "out"
     assert main(["calibrate", *told, f"--out={out}", "--arms=held"]) == 0

@@ -16,7 +16,7 @@ from rbl_gym import estimators, metrics, motion
 from rbl_gym.app import bench_report
 from rbl_gym.app.cli import main
 from rbl_gym.estimators import filter as belief
-from rbl_gym.geometry import bodies, rotations
+from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Files, read_recording
 from rbl_gym.studies import extras, monte_carlo, replay
@@ -24,6 +24,7 @@ from rbl_gym.studies.bench import figures as bench_figures
 from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.bench import worlds as bench_worlds
 from rbl_gym.worlds import scenes
+from tests import recorded
 from tests.helpers import ROOT
 
 SHORT = {"name": "uwb_room", "steps": 4}
@@ -478,21 +479,9 @@ def recording(tmp_path):
     anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
     nominal = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], 40)
     path = motion.simulate(nominal, 0.2, motion.ProcessNoise())
-    pose = path.rotation, path.translation
-    measured = ranging.simulate(anchors, tags, *pose, ranging.RangeNoise(0.03), rng).ranges
-    tables = {
-        "anchors": ("anchor,x,y,z", [[i, *a] for i, a in enumerate(anchors)]),
-        "tags": ("tag,x,y,z", [[i, *c] for i, c in enumerate(tags)]),
-        "truth": ("t,x,y,z,qw,qx,qy,qz", np.column_stack(
-            [0.2 * np.arange(41), path.translation, rotations.quaternion(path.rotation)])),
-        "ranges": ("t,anchor,tag,range", [
-            [0.2 * k, a, t, measured[k, a, t]]
-            for k in range(41) for a in range(6) for t in range(len(tags))]),
-    }  # fmt: skip
-    for name, (header, values) in tables.items():
-        lines = [",".join(map(str, row)) for row in values]
-        (tmp_path / f"{name}.csv").write_text("\n".join([header, *lines]))
-    names = "".join(f'{name} = "{name}.csv"\n' for name in tables)
+    ranges = ranging.simulate(anchors, tags, *path, ranging.RangeNoise(0.03), rng).ranges
+    files = recorded.files(tmp_path, anchors, tags, 0.2 * np.arange(41), ranges, path)
+    names = "".join(f'{name} = "{name}.csv"\n' for name in files)
     path = tmp_path / "walk.toml"
     path.write_text(f"{names}range_std_m = 0.03\nwalk_m = 0.5\nwalk_deg = 25\n")
     return path

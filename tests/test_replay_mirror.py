@@ -14,6 +14,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests import recorded
 from tests.helpers import needs
 
 ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2], [8, 3, 0.5]])
@@ -180,16 +181,8 @@ def test_the_note_is_printed(capsys):
 @needs("plotly")
 def test_the_command_takes_a_volume(tmp_path, capsys):
     recording = record(CEILING, FLAT, epochs=6)
-    columns = [f"a{m}t{n}" for m in range(6) for n in range(4)]
-    rows = np.column_stack([recording.times, recording.ranges.reshape(6, -1)])
-    texts: dict[str, Any] = {"ranges": (["t", *columns], rows)}
-    for name, points in (("anchor", CEILING), ("tag", FLAT)):
-        texts[f"{name}s"] = [name, "x", "y", "z"], [[i, *p] for i, p in enumerate(points)]
-    command = ["replay"]
-    for name, (header, table) in texts.items():
-        lines = [",".join(header), *(",".join(map(str, row)) for row in table)]
-        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
-        command += [f"--{name}", str(tmp_path / f"{name}.csv")]
+    files = recorded.files(tmp_path, CEILING, FLAT, recording.times, recording.ranges)
+    command = ["replay", *recorded.options(files)]
     page = tmp_path / "page.html"
     assert main([*command, "--html", str(page)]) == 0
     assert "a mirror pose behind" in capsys.readouterr().out

@@ -13,6 +13,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.geometry import bodies
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests import recorded
 from tests.helpers import with_kernels
 from tests.recorded import ROOM, flight, swaying
 
@@ -108,23 +109,10 @@ def test_soft_knowledge_and_the_loss_for_late_ranges():
     assert figures[1]["position_rmse_m"] < 0.06
 
 
-def table(path: Path, header: str, rows) -> str:
-    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
-    return str(path)
-
-
 def test_the_command_prints_both_tracks(tmp_path, capsys):
     log = flight(TAGS, count=20)
-    links = np.ndenumerate(log.ranges)
-    files = {
-        "ranges": table(
-            tmp_path / "r.csv", "t,anchor,tag,range",
-            [(round(0.1 * k, 3), m, n, r) for (k, m, n), r in links],
-        ),
-        "anchors": table(tmp_path / "a.csv", "anchor,x,y,z", [(i, *a) for i, a in enumerate(ROOM)]),
-        "tags": table(tmp_path / "t.csv", "tag,x,y,z", [(i, *c) for i, c in enumerate(TAGS)]),
-    }  # fmt: skip
-    command = ["replay", *(part for name, file in files.items() for part in (f"--{name}", file))]
+    files = recorded.files(tmp_path, ROOM, TAGS, log.times, log.ranges)
+    command = ["replay", *recorded.options(files)]
     assert main([*command, "--smooth", "--smooth-accel-m", "0.3", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["settings"]["smooth_accel_m"] == 0.3

@@ -20,6 +20,7 @@ from rbl_gym.recordings import (
     write_track,
 )
 from rbl_gym.studies import replay
+from tests import recorded
 
 COUNT = 7
 
@@ -144,30 +145,22 @@ def test_ranks_of_epochs_are_those_of_their_jacobians():
     assert found.figures["microseconds_per_epoch"] > 0
 
 
-def write_log(folder, recording):
-    rows = ["t,anchor,tag,range"]
-    for k, i, j in np.argwhere(recording.links):
-        rows.append(f"{recording.times[k]},{'abcde'[i]},{j + 1},{recording.ranges[k, i, j]}")
-    (folder / "r.csv").write_text("\n".join(rows))
-    for name, kind, points in (("a", "anchor", ANCHORS), ("t", "tag", TAGS)):
-        ids = "abcde" if kind == "anchor" else "123"
-        lines = [f"{i},{x},{y},{z}" for i, (x, y, z) in zip(ids, points, strict=False)]
-        (folder / f"{name}.csv").write_text("\n".join([f"{kind},x,y,z", *lines]))
-    return [f"--{name}={folder}/{name[0]}.csv" for name in ("ranges", "anchors", "tags")]
-
-
 @pytest.mark.parametrize("ending", ["tum", "csv"])
 def test_the_command_writes_a_track_that_judges_itself(ending, tmp_path, capsys):
-    files = write_log(tmp_path, log())
+    recording = log()
+    seen = recording.links.any(axis=(1, 2))
+    ranges = np.where(recording.links, recording.ranges, np.nan)[seen]
+    files = recorded.files(tmp_path, ANCHORS, TAGS, recording.times[seen], ranges)
+    command = ["replay", *recorded.options(files)]
     path = tmp_path / f"track.{ending}"
-    assert main(["replay", *files, f"--track={path}"]) == 0
+    assert main([*command, f"--track={path}"]) == 0
     assert str(path) in capsys.readouterr().out
     assert len(read_track(path).times) == 19
     # Of its own track a run has no errors.
-    assert main(["replay", *files, f"--truth={path}", "--json", str(tmp_path / "f.json")]) == 0
+    assert main([*command, f"--truth={path}", "--json", str(tmp_path / "f.json")]) == 0
     figures = json.loads((tmp_path / "f.json").read_text())
     assert figures["epochs_with_truth"] == 19
     assert figures["position_rmse_m"] < 1e-12
     assert figures["rotation_rmse_deg"] < 1e-10
-    assert main(["replay", *files, "--track", str(tmp_path / "track.png")]) == 2
+    assert main([*command, "--track", str(tmp_path / "track.png")]) == 2
     assert "a track must end in" in capsys.readouterr().err

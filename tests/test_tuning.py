@@ -10,6 +10,7 @@ import pytest
 from rbl_gym.app import cli
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
+from tests import recorded
 from tests.helpers import with_kernels
 from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording
 
@@ -105,22 +106,8 @@ def test_a_log_too_short_to_tune_by_is_refused():
 
 def written(folder):
     """The files of a log, as arguments."""
-    ids = [(m, n) for m in range(7) for n in range(5)]
-    rows = [
-        f"{0.1 * k:.1f}," + ",".join(f"{x:.4f}" for x in r.ravel()) for k, r in enumerate(RANGES)
-    ]
-    header = "t," + ",".join(f"aA{m}tT{n}" for m, n in ids)
-    texts = {
-        "ranges": "\n".join([header, *rows]),
-        "anchors": "anchor,x,y,z\n"
-        + "\n".join(f"A{m},{x},{y},{z}" for m, (x, y, z) in enumerate(ANCHORS)),
-        "tags": "tag,x,y,z\n" + "\n".join(f"T{n},{x},{y},{z}" for n, (x, y, z) in enumerate(TAGS)),
-    }
-    arguments = ["replay"]
-    for name, text in texts.items():
-        (folder / f"{name}.csv").write_text(text)
-        arguments += [f"--{name}", str(folder / f"{name}.csv")]
-    return arguments
+    times = 0.1 * np.arange(len(RANGES))
+    return ["replay", *recorded.options(recorded.files(folder, ANCHORS, TAGS, times, RANGES))]
 
 
 @with_kernels
