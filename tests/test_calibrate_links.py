@@ -265,6 +265,7 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
     bias = rng.normal(0.2, 0.1, (6, 4))
     ranges = ranges_of(times, rng, bias=bias, noise=0.02)
     files = recorded.files(tmp_path, ANCHORS, TAGS, times, ranges, path_of(times))
+    calibrate.write_points(files["anchors"], "anchor", "012345", ANCHORS)
     arguments = recorded.options(files)
     out = tmp_path / "out"
     plot = tmp_path / "links.png"

@@ -21,7 +21,6 @@ from rbl_gym.studies.learning import policies
 from rbl_gym.studies.learning.deep_sets import DeepSets
 from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
 from rbl_gym.studies.replay import causes
-from tests import recorded
 from tests.helpers import ROOT, needs
 
 # Its blocks are files of a package: tests/test_your_estimator.py.
@@ -48,9 +47,16 @@ def write_files_that_pages_read(folder: Path) -> None:
     anchors = np.array([[0, 0, 0], [8, 0, 2], [0, 6, 2], [8, 6, 0], [4, 3, 3.0]])
     tags = np.array([[0.4, 0, 0], [-0.4, 0.3, 0], [0, -0.3, 0.3], [0, 0, -0.4]])
     noise, rng = ranging.RangeNoise(0.05), np.random.default_rng(0)
-    pose = np.tile(np.eye(3), (3, 1, 1)), np.tile([3.0, 2, 1], (3, 1))
-    ranges = ranging.simulate(anchors, tags, *pose, noise, rng).ranges
-    recorded.files(folder, anchors, tags, [0.0, 0.1, 0.2], ranges, pose)
+    lines = {"anchors": ["anchor,x,y,z"], "tags": ["tag,x,y,z"], "ranges": ["t,anchor,tag,range"],
+             "truth": ["t,x,y,z,qw,qx,qy,qz"]}  # fmt: skip
+    for name, places in (("anchors", anchors), ("tags", tags)):
+        lines[name] += [f"{i},{x},{y},{z}" for i, (x, y, z) in enumerate(places.tolist())]
+    for t in (0.0, 0.1, 0.2):
+        measured = ranging.simulate(anchors, tags, np.eye(3), [3, 2, 1], noise, rng).ranges
+        lines["ranges"] += [f"{t},{m},{n},{r}" for (m, n), r in np.ndenumerate(measured)]
+        lines["truth"].append(f"{t},3,2,1,1,0,0,0")
+    for name, text in lines.items():
+        (folder / f"{name}.csv").write_text("\n".join(text) + "\n")
     (folder / "out").mkdir()
     layer = np.zeros((3, 22)), np.zeros(3)
     policy = policies.Policy((layer[0],), (layer[1],), "box", {"task": "auv_buoys"})

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.app.place_shapes import Solid, solids
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.polygons import ears
@@ -133,10 +134,10 @@ def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None)
         lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), EDGE, 1)
     tall = low[2] + _TALL * (high - low)[2]
     for name, opacity, which in (("racks", 0.85, False), ("walls-within", 0.3, True)):
-        solids = [solid for solid in solids_of(problem) if (solid[2] > tall) == which]
-        if solids:
+        shown = [solid for solid in solids(problem) if (solid.high_m > tall) == which]
+        if shown:
             scene.add_mesh_simple(
-                f"/room/{name}", *mesh_of(solids), color=RACK, opacity=opacity,
+                f"/room/{name}", *mesh_of(shown), color=RACK, opacity=opacity,
                 flat_shading=True, side="double",
             )  # fmt: skip
 
@@ -218,21 +219,10 @@ def _mount_faces(mounts: Mounts) -> tuple[FloatArray, np.ndarray]:
     return np.array(vertices).reshape(-1, 3), np.array(triangles, int).reshape(-1, 3)
 
 
-Solid = tuple[FloatArray, float, float]
-
-
-def solids_of(problem: Problem) -> list[Solid]:
-    """Return all obstacles: corners (V, 2) in the plan, lower and upper height."""
-    boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
-    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    found = [(box[:2] + turns * box[3:5], box[2] - box[5], box[2] + box[5]) for box in boxes]
-    return found + list(zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True))
-
-
-def mesh_of(solids: list[Solid]) -> tuple[FloatArray, np.ndarray]:
+def mesh_of(shown: list[Solid]) -> tuple[FloatArray, np.ndarray]:
     """Return solids as vertices (K, 3) and triangles (T, 3)."""
     points, triangles, count = [], [], 0
-    for ring, low, high in solids:
+    for ring, low, high, _ in shown:
         # Corners of prisms are repeated up to a common number.
         ring = ring[np.append(True, (np.diff(ring, axis=0) != 0).any(axis=1))]
         size, here = len(ring), np.arange(len(ring))
