@@ -62,16 +62,8 @@ def on_ring(
 ) -> FloatArray:
     """Return targets (B, M, 2) of craft on a ring, in the order of their bearings.
 
-    Parameters
-    ----------
-    centre
-        Centre of the ring (B, 3), at the vehicle's depth.
-    craft, reach_m
-        Positions (B, M, 3), and the longest move in a step (B,).
-    depths
-        Radius in units of the vehicle's depth.
-    ahead
-        How many steps along the ring the targets are ahead of the craft.
+    The ring's centre (B, 3) is at the vehicle's depth, its radius in units of that depth; craft (B,
+    M, 3) move at most `reach_m` (B,) in a step, and targets are `ahead` steps along the ring.
     """
     n_craft = craft.shape[-2]
     radius = depths * np.maximum(np.abs(centre[:, 2]), 10.0)[:, None]

@@ -19,14 +19,8 @@ KEPT, _APART_M = 4, 2.0
 class SightMemory(NamedTuple):
     """Events of each anchor, the newest first: arrays (B, M, KEPT), `place` (B, M, KEPT, 3).
 
-    Attributes
-    ----------
-    place
-        Position of the body.
-    sight
-        1: the body was in sight of the anchor; -1: it was not; 0: no event.
-    age
-        Steps since then.
+    `place` is the position of the body; `sight` 1: it was in sight of the anchor, -1: it was not,
+    0: no event; `age` the steps since then.
     """
 
     place: FloatArray

@@ -33,22 +33,10 @@ def mobile_anchors(
 ) -> tuple[np.ndarray, FloatArray]:
     """Return the numbers (..., M) of the craft in order, and the view (..., 15 + 3 M).
 
-    Parameters
-    ----------
-    translation, rotation, covariance
-        Mean and covariance of the belief.
-    twist
-        Known twist (..., 6).
-    anchors
-        Craft (..., M, 3).
-    prior_variance
-        Usual variances (6,) of the belief.
-    speed
-        Usual speed.
-    sort
-        Whether to sort by the bearing from the estimate, so that equal situations look equal.
-    limits
-        Limits (15 + 3 M,) of the entries, all equal; entries are cut to them.
+    From mean and covariance of the belief, its usual variances (6,), the known twist (..., 6) and
+    the craft (..., M, 3) of a usual speed. With `sort` they are sorted by the bearing from the
+    estimate, so that equal situations look equal. Entries are cut to `limits` (15 + 3 M,), all
+    equal.
     """
     gap = (anchors - translation[..., None, :]) / 100
     order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1, kind="stable")
@@ -105,16 +93,8 @@ def padded_craft(
 ) -> tuple[np.ndarray, FloatArray]:
     """Return order (..., M) and view (..., 16 + 4 M) of the existing craft.
 
-    Parameters
-    ----------
-    view
-        `mobile_anchors` of `told`.
-    told
-        The first arguments of `mobile_anchors`; the last of them are the craft (..., M, 3).
-    mask
-        (..., M), 1 for existing craft.
-    reach_m
-        Longest move in a step (...).
+    `view` is `mobile_anchors` of `told`, its first arguments, the last of which are the craft (...,
+    M, 3). `mask` (..., M) is 1 for existing craft; `reach_m` (...) the longest move in a step.
     """
     m, counts = mask.shape[-1], mask.sum(axis=-1)
     order = np.broadcast_to(np.arange(m), mask.shape).copy()

@@ -50,17 +50,9 @@ def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> Bo
 
     This is so if the linear update leaves fewer vague directions than the prior has. It is computed
     at the prior position and one standard deviation from it on all sides, because the information
-    of coplanar anchors vanishes in their plane.
-
-    Parameters
-    ----------
-    problem
-        The least-squares problem of the update. With a robust loss, poor fits would give little
-        information.
-    vague
-        Trials (...) to check, from `is_vague`; the others are False.
-    batch
-        Leading axes of the problem.
+    of coplanar anchors vanishes in their plane. `problem` is that of the update by least squares:
+    with a robust loss, poor fits would give little information. Checked are the trials `vague`
+    (...), from `is_vague`; the others are False.
     """
     # A single trial has no axis to index, so one is added.
     axes = batch or (1,)

@@ -57,15 +57,9 @@ def consensus(
 ) -> tuple[FloatArray, int, bool]:
     """Estimate orientations (n,) by the cycle iteration; return also steps and convergence.
 
-    Parameters
-    ----------
-    links, bearings
-        (n, n) symmetric; (n, n) of j in the frame of i, radians.
-    before
-        Approximate orientations (n,). Edge angles are then taken within pi of theirs, so that the
-        branch of every cycle is known.
-    options, rng
-        Options of the iteration, and the random generator of its order.
+    Links are (n, n) symmetric, bearings (n, n) of j in the frame of i, radians. With approximate
+    orientations `before` (n,), edge angles are taken within pi of theirs, so that the branch of
+    every cycle is known. `rng` draws the order of the iteration.
     """
     options = options or Consensus()
     n_nodes = len(links)
@@ -113,16 +107,9 @@ def network_belief(
     """Return the belief about given orientations; with lengths, maximum-likelihood poses.
 
     Variances are scaled by max(1, chi-square per degree of freedom of the residuals). The variances
-    of the prior are an upper bound.
-
-    Parameters
-    ----------
-    links, bearings, lengths
-        (..., n, n) as in `network_poses`; lengths are None if not measured.
-    orientations, positions
-        (..., n) from `consensus`, and (..., n, 2). Nodes without a path to node 0 keep these.
-    sensing
-        Standard deviations of the sensors and of the prior.
+    of the prior are an upper bound. Links, bearings and lengths (None if not measured) are (..., n,
+    n) as in `network_poses`; orientations (..., n) are from `consensus`, positions (..., n, 2).
+    Nodes without a path to node 0 keep these.
     """
     if lengths is None:
         P = linked_covariance(links, sensing.bearing_std_rad, sensing.prior_std_rad)

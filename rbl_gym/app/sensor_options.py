@@ -87,10 +87,7 @@ def add_clocks(group: Any) -> None:
 def told_clocks(options: argparse.Namespace) -> dict[str, Any]:
     """Return settings of the given clocks; that of the truth may be ``"auto"``.
 
-    Raises
-    ------
-    ValueError
-        If there is no sensor for a clock.
+    ValueError if there is no sensor for a clock.
     """
     told = dict(options.time_offsets or ())
     for what in told:

@@ -54,17 +54,10 @@ def _under_errstate(function: Callable[..., Any], *args: Any) -> Any:
 
 
 class Compiled:
-    """A function with a textbook form and a kernel, created by `compiled`.
+    """A function with a `textbook` form in NumPy and a `kernel`, created by `compiled`.
 
     It takes positional arguments only, and runs with floating-point warnings off: NaN inputs give
     NaN outputs, which callers must handle. Like functions, it is pickled by name.
-
-    Attributes
-    ----------
-    textbook
-        The form in NumPy.
-    kernel
-        The generalized ufunc; its first use compiles it, or loads it from the disk.
     """
 
     __slots__ = ("__dict__", "_run", "name", "textbook")
@@ -109,12 +102,9 @@ class Compiled:
 def compiled(name: str) -> Callable[[Callable[..., Any]], Compiled]:
     """Return a decorator of a textbook form: calls run the kernel `name` if it is available.
 
-    Parameters
-    ----------
-    name
-        ``"module:function"`` of a function in this package decorated with
-        `rbl_gym.kernels.jit.gufunc`. It takes the same arguments as the textbook form. The textbook
-        form must broadcast over leading axes as the kernel does.
+    The kernel is ``"module:function"`` of a function in this package decorated with
+    `rbl_gym.kernels.jit.gufunc`. It takes the same arguments as the textbook form, which must
+    broadcast over leading axes as the kernel does.
     """
     return functools.partial(Compiled, name)
 

@@ -155,15 +155,9 @@ def inlined(function: F, unrolled: bool = False) -> F:
 def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
     """Return a decorator that makes a generalized ufunc; the function writes its last arguments.
 
-    The function itself does not change; its attribute ``build()`` compiles it, once.
-
-    Parameters
-    ----------
-    signature
-        Signature as in NumPy, such as ``"(d,d),(d),()->(d)"``; an output ``()`` is written as
-        ``out[0]``.
-    types
-        One letter for each argument: f (float64), i (int64) or b (bool). Empty: all f.
+    The function itself does not change; its attribute ``build()`` compiles it, once. The signature
+    is as in NumPy, such as ``"(d,d),(d),()->(d)"``; an output ``()`` is written as ``out[0]``.
+    `types` has one letter for each argument: f (float64), i (int64) or b (bool). Empty: all f.
     """
     axes = [part.strip("()") for part in signature.replace("->", ",").replace(" ", "").split("),")]
     ranks = [part.count(",") + 1 if part else 0 for part in axes]

@@ -328,10 +328,7 @@ class WeakenedNoise:
 def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:
     """Return the law of N tags as used by the kernels; None if they do not support it.
 
-    Raises
-    ------
-    ValueError
-        If the reference tag does not exist.
+    ValueError if the reference tag does not exist.
     """
     numbers = getattr(noise, "numbers", None)
     if numbers is not None and numbers.ndim == 1 and numbers.item(3) >= n_tags:

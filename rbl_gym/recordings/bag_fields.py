@@ -33,11 +33,8 @@ class EachItem(list[Any]):
 def getter(path: str) -> Getter:
     """Return a function that reads the value at `path` from a message.
 
-    Raises
-    ------
-    ValueError
-        If `path` is not a valid path. The returned function raises a KeyError that names the
-        missing field and those that exist.
+    ValueError if `path` is not a valid path. The returned function raises a KeyError that names the
+    missing field and those that exist.
     """
     if path.startswith("="):
         return lambda _: path[1:]
@@ -58,10 +55,7 @@ def getter(path: str) -> Getter:
 def rows(received: Received, getters: Iterable[Getter]) -> list[tuple[Any, ...]]:
     """Return the values of a message: one tuple per item if a path has ``[]``, else one tuple.
 
-    Raises
-    ------
-    ValueError
-        If two lists of the message have different lengths.
+    ValueError if two lists of the message have different lengths.
     """
     values = [get(received) for get in getters]
     lengths = {len(value) for value in values if isinstance(value, EachItem)}

@@ -121,10 +121,7 @@ class Source(NamedTuple):
 def read_mapping(path: str) -> dict[str, Table]:
     """Read the tables of a TOML file.
 
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, or is not valid TOML.
+    ValueError if the file cannot be read, or is not valid TOML.
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -156,10 +153,7 @@ def sources(
 ) -> tuple[dict[str, Source], list[str]]:
     """Return what to read from `topics` (name: type), and notes on what was not chosen.
 
-    Raises
-    ------
-    ValueError
-        If a topic named in the mapping does not exist, or a value has no field path.
+    ValueError if a topic named in the mapping does not exist, or a value has no field path.
     """
     found: dict[str, Source] = {}
     notes: list[str] = []

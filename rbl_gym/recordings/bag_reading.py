@@ -184,10 +184,7 @@ class Values:
     def finish(self) -> None:
         """Handle rows without a stamp: if all lack it, use the time of recording; else drop them.
 
-        Raises
-        ------
-        ValueError
-            If times in `time_unit` span far more or far less than the recording.
+        ValueError if times in `time_unit` span far more or far less than the recording.
         """
         bad = [time <= 0 and not self._is_number for time, _ in self.rows]
         if all(bad) and "time" not in self.source.given:

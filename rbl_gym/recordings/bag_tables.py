@@ -41,10 +41,7 @@ def make_tables(
 ) -> Tables:
     """Return the files of one kind from its message values; `given`: keys named by the user.
 
-    Raises
-    ------
-    ValueError
-        If a value has the wrong form, or a tag has several positions on the body.
+    ValueError if a value has the wrong form, or a tag has several positions on the body.
     """
     notes: list[str] = []
     times = np.array([time for time, _ in rows], dtype=np.int64)

@@ -29,14 +29,8 @@ def read_differences(
 ) -> tuple[Measured, IntArray, Ids]:
     """Read the differences of a table ``t,anchor_a,anchor_b,tag,difference[,std or var]``.
 
-    Returns
-    -------
-    The differences, assigned to `anchor_a`; the second anchor of each; ids of anchors and tags.
-
-    Raises
-    ------
-    ValueError
-        If columns are missing, or the anchor positions are not given.
+    Returned are the differences, assigned to `anchor_a`; the second anchor of each; ids of anchors
+    and tags. ValueError if columns are missing, or the anchor positions are not given.
     """
     table.require("t", "anchor_a", "anchor_b", *id_columns(tag=tags), "difference")
     if anchors is None:

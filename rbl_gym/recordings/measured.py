@@ -83,10 +83,7 @@ def read_measured(
 ) -> tuple[Measured, Ids]:
     """Read the ranges of a table, and the ids of their anchors and tags.
 
-    Raises
-    ------
-    ValueError
-        If columns are missing, or tags or anchors are not given.
+    ValueError if columns are missing, or tags or anchors are not given.
     """
     pattern = format.of("ranges").columns.get("range", "")
     if "{" in pattern:
@@ -299,10 +296,7 @@ def judge(measured: Measured, table: Table, signed: bool) -> None:
 def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Said) -> None:
     """Count the ranges that are not links; raise if `strict` or if they are more than a fifth.
 
-    Raises
-    ------
-    ValueError
-        With file, line and column of the first such range.
+    ValueError with file, line and column of the first such range.
     """
     counts = Counter({_NAMES[c]: int(n) for c, n in enumerate(np.bincount(measured.cause)) if n})
     said.ranges += len(measured.cause) - counts["empty"]

@@ -46,12 +46,8 @@ def read_log(
     """Read the ranges of a table, long or wide.
 
     Without a table of anchors, their positions are columns of the table. Without a table of tags,
-    there is one tag, at the origin of the body frame.
-
-    Raises
-    ------
-    ValueError
-        As in `rbl_gym.recordings.read_recording`.
+    there is one tag, at the origin of the body frame. ValueError as in
+    `rbl_gym.recordings.read_recording`.
     """
     if format.strict and table.cut:
         raise ValueError(f"{table.path}, line {table.cut}: the last line is cut off")

@@ -28,10 +28,7 @@ _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 def seconds_per(unit: str) -> float:
     """Return the length of one `unit` of time in seconds.
 
-    Raises
-    ------
-    ValueError
-        If `unit` is not one of s, ms, us, ns.
+    ValueError if `unit` is not one of s, ms, us, ns.
     """
     if unit not in TIME_UNITS:
         raise ValueError(f"time unit must be one of {[*TIME_UNITS, 'iso']}, got {unit!r}")

@@ -219,13 +219,9 @@ class Table(NamedTuple):
 def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str] = ()) -> Table:
     """Read the cells of a file with a header; `headless` names the columns of a table without one.
 
-    If `source` names columns by numbers, from 1, the table has no header.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, a row does not fit the header, a column named by `source`
-        does not exist, or no row is left.
+    If `source` names columns by numbers, from 1, the table has no header. ValueError if the file
+    cannot be read, a row does not fit the header, a column named by `source` does not exist, or no
+    row is left.
     """
     asked = {_name_and_unit(name)[0] for name in source.columns.values()}
     numbered = bool(asked) and all(name.isdigit() for name in asked)

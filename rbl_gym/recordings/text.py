@@ -45,12 +45,8 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
     begin with ``#`` are skipped. There is one exception: if the first row holds numbers, the header
     is the last comment above it whose cells fit the row. If there is no such comment either,
     columns separated by white space get the names `headless`, if their number fits. With
-    `numbered`, the columns of any table without a header are 1, 2 and so on.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, has no header or no row, or a row does not fit the header.
+    `numbered`, the columns of any table without a header are 1, 2 and so on. ValueError if the file
+    cannot be read, has no header or no row, or a row does not fit the header.
     """
     lines = _read_lines(path)
     if _SEPARATOR.match(lines[0]):

@@ -41,15 +41,10 @@ def check_units(
     """Raise ValueError if ranges (K, M, N), anchors (M, 3) and tags (N, 3) cannot be in one unit.
 
     A range r of a point p obeys ``|r - r'| <= |p - p'| <= r + r'`` for two anchors of one tag and
-    for two tags of one anchor; noise adds to the left side. `paths` are the files of the ranges,
-    the anchors and the tags, for the message. `anchors_are`: ``"stand"`` if they are fixed around
-    the body, ``"carried"`` if they are on another body, which may be far away, ``"move"`` if they
-    move around these positions.
-
-    Raises
-    ------
-    ValueError
-        If most pairs break an inequality by more than noise does.
+    for two tags of one anchor; noise adds to the left side. Most pairs must obey it. `paths` are
+    the files of the ranges, the anchors and the tags, for the message. `anchors_are`: ``"stand"``
+    if they are fixed around the body, ``"carried"`` if they are on another body, which may be far
+    away, ``"move"`` if they move around these positions.
     """
     typical = float(np.median(ranges[links]))
     layout = np.linalg.norm(anchors - anchors.mean(axis=0), axis=-1).mean()

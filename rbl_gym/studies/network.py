@@ -118,12 +118,8 @@ def _solved(path: str, graph: PoseGraph, weights: str) -> Solved:
 def edge_weights(graph: PoseGraph) -> FloatArray:
     """Return the information of theta (m,), I33 of each edge; 1 if the file has none.
 
-    An edge that is not on a cycle needs none: its angle is used unchanged.
-
-    Raises
-    ------
-    ValueError
-        If some edges on cycles have information and others do not; the message names the first.
+    An edge that is not on a cycle needs none: its angle is used unchanged. ValueError if some edges
+    on cycles have information and others do not; the message names the first.
     """
     if graph.information is None:
         return np.ones(len(graph.edges))

@@ -46,14 +46,9 @@ Points = tuple[tuple[float, float, float], ...]
 class FlatScales(NamedTuple):
     """Scales of a scene that bring observations to order one.
 
-    Attributes
-    ----------
-    middle, half
-        Centre and half size of the volume (..., 3), metres.
-    extent
-        Half the diagonal of the box around volume and anchors (...), metres.
-    rates
-        Scales of a twist (..., 6): pi/10 per step, and the body's speed.
+    Centre and half size of the volume (..., 3), half the diagonal of the box around volume and
+    anchors (...), all in metres, and the scales of a twist (..., 6): pi/10 per step, and the body's
+    speed.
     """
 
     middle: FloatArray

@@ -26,21 +26,9 @@ _FOREIGN = "host must be an address of this machine, got {!r}"
 def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym studio") -> Any:
     """Open a viser server with the theme of the studio.
 
-    Parameters
-    ----------
-    host
-        Address on which it listens. Other machines can open the page unless it is loopback.
-    port
-        First port to try; the first free one is used. 0 selects any.
-    title
-        Title of the panel.
-
-    Raises
-    ------
-    MissingExtraError
-        If viser is missing (extra ``studio``).
-    ValueError
-        If the address does not belong to this machine, or no port is free.
+    Other machines can open the page unless the address `host` is loopback. The first free port from
+    `port` on is used; 0 selects any. Raises MissingExtraError without viser (extra ``studio``),
+    ValueError if the address does not belong to this machine or no port is free.
     """
     require("viser", "studio")
     import viser

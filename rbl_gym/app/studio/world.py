@@ -26,17 +26,9 @@ MOST_LOSS_DB, LEAST_TAGS = 60.0, 3
 class Knobs(NamedTuple):
     """Properties of a problem that can change while the anchors stay.
 
-    Attributes
-    ----------
-    noise_m
-        The constant part of a range's standard deviation, metres.
-    n_tags
-        Number of tags. If it differs from the body's own, the tags are spread evenly on a sphere.
-    size_m
-        Largest extent of the tags, metres.
-    loss_db
-        Loss of a link's information behind an opaque obstacle, decibels. Obstacles with a share of
-        their own change in proportion.
+    The constant part of a range's standard deviation; the number of tags, if it differs from the
+    body's own, spread evenly on a sphere, and their largest extent; the loss of a link's
+    information behind an opaque obstacle (those with a share of their own change in proportion).
     """
 
     noise_m: float

@@ -39,15 +39,9 @@ class BenchErrors(NamedTuple):
 class Reference(NamedTuple):
     """References for errors.
 
-    Attributes
-    ----------
-    bound
-        Expected errors (K, B) by the posterior Cramer-Rao bound, by part.
-    prior_tags_m
-        Expected tag error (B,) of the prior.
-    mirror_m
-        Distance (B,) of the last position to the image of the truth in the plane of the anchors;
-        None if they have no plane.
+    The expected errors (K, B) by the posterior Cramer-Rao bound, by part; the expected tag error
+    (B,) of the prior; the distance (B,) of the last position to the image of the truth in the plane
+    of the anchors, None if they have no plane.
     """
 
     bound: dict[str, FloatArray]
@@ -134,19 +128,11 @@ def differences(
 ) -> dict[str, dict[str, Any]]:
     """Return how much worse each filter is than the best one, by root mean squares over the trials.
 
-    Parameters
-    ----------
-    per_trial
-        By filter and by part in `PARTS`: the root mean square error of every trial. All filters run
-        on the same trials.
-    seed
-        Seed of the resamples, which are the same for all filters.
-
-    Returns
-    -------
-    For each filter and part: `best` (the filter with the smallest error), `difference`, and the
-    limits `low` and `high` of its 95 % interval by the paired bootstrap over trials; None if an
-    error is not finite.
+    `per_trial` has, by filter and by part in `PARTS`, the root mean square error of every trial;
+    all filters run on the same trials. The resamples of `seed` are the same for all filters. For
+    each filter and part: `best` (the filter with the smallest error), `difference`, and the limits
+    `low` and `high` of its 95 % interval by the paired bootstrap over trials; None if an error is
+    not finite.
     """
     names = list(per_trial)
     result: dict[str, dict[str, Any]] = {name: {} for name in names}

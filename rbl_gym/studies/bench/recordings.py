@@ -44,10 +44,7 @@ class Log(NamedTuple):
 def load_recording(spec: Mapping[str, Any]) -> Log:
     """Return the recording described by a mapping: its files, and fields of `replay.Settings`.
 
-    Raises
-    ------
-    ValueError
-        If a key is unknown, or ranges, anchors, tags or truth are missing.
+    ValueError if a key is unknown, or ranges, anchors, tags or truth are missing.
     """
     unknown = [key for key in spec if key not in (*FILES, *SETTINGS)]
     if unknown:

@@ -43,19 +43,10 @@ class StoppedError(Exception):
 class BenchStage(NamedTuple):
     """A world of the benchmark, on which filters run.
 
-    Attributes
-    ----------
-    make
-        Function that makes a filter from a name and options, with the laws known to filters.
-    track
-        Function that runs a filter over all epochs.
-    figures
-        Function that computes all figures of a run.
-    anchors, tags
-        The true geometry. `pose_rank` is the number of pose directions that it determines, None if
-        this depends on the path.
-    batch
-        Leading axes of a belief.
+    `make` makes a filter from a name and options, with the laws known to filters; `track` runs it
+    over all epochs; `figures` computes all figures of a run. `anchors` and `tags` are the true
+    geometry, `pose_rank` the number of pose directions that it determines, None if this depends on
+    the path, and `batch` the leading axes of a belief.
     """
 
     make: Callable[[str, dict[str, Any]], estimators.Filter]

@@ -40,23 +40,11 @@ _WORLD, _LINKS, _TOLD = range(3)
 class BenchWorld(NamedTuple):
     """A batch of B episodes of K epochs.
 
-    Attributes
-    ----------
-    told
-        The scene as known to filters: tags, noise, process, dt.
-    tags
-        True tag positions on the body (N, 3).
-    rotation, translation
-        True poses (K, B, 3, 3), (K, B, 3).
-    readings
-        Inputs of filters, one per epoch.
-    prior
-        Rotation, translation and covariance before the first epoch.
-    bound
-        Posterior Cramer-Rao covariance (K, B, 6, 6) under the true laws, for the links with a
-        range; reflected ranges count as direct.
-    anchors
-        True positions (B, M, 3).
+    `told` is the scene as known to filters: tags, noise, process, dt. `tags` (N, 3) and `anchors`
+    (B, M, 3) are the true ones; true poses have axes (K, B, ...); `readings` are the inputs of
+    filters, one per epoch, `prior` is rotation, translation and covariance before the first.
+    `bound` (K, B, 6, 6) is the posterior Cramer-Rao covariance under the true laws, for the links
+    with a range; reflected ranges count as direct.
     """
 
     told: Scene

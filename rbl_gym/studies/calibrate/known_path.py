@@ -37,10 +37,7 @@ class Log(NamedTuple):
 def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
     """Check the runs and return them as one log.
 
-    Raises
-    ------
-    ValueError
-        If runs differ in anchors or tags, or have no usable truth.
+    ValueError if runs differ in anchors or tags, or have no usable truth.
     """
     if not recordings:
         raise ValueError("recordings must hold a run, got none")

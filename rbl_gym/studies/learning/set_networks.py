@@ -15,12 +15,8 @@ nn: Any = torch.nn
 class SetNetwork(nn.Module):
     """The same function as `DeepSets`, with gradients.
 
-    Parameters
-    ----------
-    n_own, n_pair, n_out
-        Lengths of the rows of elements, of pairs and of the output.
-    inner, outer
-        Sizes of the hidden layers.
+    The numbers are the lengths of the rows of elements, of pairs and of the output; `inner` and
+    `outer` the sizes of the hidden layers.
     """
 
     def __init__(

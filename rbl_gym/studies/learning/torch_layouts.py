@@ -23,12 +23,7 @@ _HEADS = attention.HEADS
 class Network(nn.Module):
     """Attention over the tokens of a problem and one token for each anchor.
 
-    Parameters
-    ----------
-    sizes
-        Row lengths of `tokens.Tokens`.
-    width, layers
-        Width of the tokens, and number of layers.
+    `sizes` are the row lengths of `tokens.Tokens`, `width` that of the network's tokens.
     """
 
     def __init__(self, sizes: dict[str, int], width: int = 64, layers: int = 4) -> None:
@@ -102,22 +97,10 @@ class Network(nn.Module):
 class Case(NamedTuple):
     """A batch of problems of one family in their own units, as tensors.
 
-    Attributes
-    ----------
-    tags
-        (B, N, 3).
-    floor, growth
-        (B,): parameters of the noise.
-    rotation, places, weight
-        Poses (B, P, 3, 3), (B, P, 3), and their weights (B, P).
-    prior
-        Information (B, P, 6, 6), including that of fixed anchors.
-    low, high, inner, outer
-        Corners (B, 3) of the region; inner and outer radius (B,) of a shell.
-    middle
-        Centre (B, 3) of the shell.
-    boxes, left
-        (B, K, 6): obstacles; (B,): share of a link's information that they leave.
+    Tags (B, N, 3); parameters (B,) of the noise; poses (B, P, 3, 3), (B, P, 3), their weights (B,
+    P), and the information (B, P, 6, 6) besides new anchors; corners (B, 3) of the region; radii
+    (B,) and centre (B, 3) of a shell; obstacles (B, K, 6), and the share (B,) of a link's
+    information that they leave.
     """
 
     tags: torch.Tensor

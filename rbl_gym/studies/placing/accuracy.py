@@ -64,17 +64,7 @@ def _blocks(problem: Problem, anchors: FloatArray, places: FloatArray) -> list[F
 def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: int) -> FloatArray:
     """Draw positions (count, 3) of the body origin, uniform over the free part of a zone.
 
-    Parameters
-    ----------
-    problem, zone
-        The problem with its obstacles, and the zone.
-    rng, count
-        Source of randomness, and number of positions.
-
-    Raises
-    ------
-    ValueError
-        If almost no position is free.
+    ValueError if almost no position is free.
     """
     low, high = zone.bounds()
     free = np.empty((0, 3))

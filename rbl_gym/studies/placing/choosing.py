@@ -70,13 +70,7 @@ class Fewest(NamedTuple):
 
 
 def candidates(problem: Problem, rng: np.random.Generator, count: int = _CANDIDATES) -> FloatArray:
-    """Return up to `count` distinct legal mounts (K, 3); all of them if the mounts are a list.
-
-    Parameters
-    ----------
-    problem, rng, count
-        The problem with the mounts, the source of randomness, and the number to draw.
-    """
+    """Return up to `count` distinct legal mounts (K, 3); all of them if the mounts are a list."""
     listed = problem.mounts.listed()
     if listed is not None:
         return listed
@@ -95,14 +89,8 @@ def _legal(problem: Problem, points: FloatArray) -> FloatArray:
 def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int | None = None) -> Stock:
     """Return candidates (K, 3) with the information of each at random poses of the zones.
 
-    Parameters
-    ----------
-    problem, points
-        The problem, and the candidates.
-    seed
-        Seed of the poses, which differ from those of `judge_zone`.
-    n_places
-        Number of positions in all zones, with a minimum in each; None: the default.
+    The poses of `seed` differ from those of `judge_zone`. `n_places` is the number of positions in
+    all zones, with a minimum in each; None: the default.
     """
     rng = np.random.default_rng([seed, 4])
     zones, parts = [], []
@@ -134,16 +122,8 @@ def improved(
     """Improve a layout (M, 3) by exchanges; return it and its value (`stock_search.value`).
 
     One anchor at a time is exchanged for candidates everywhere, then near and far. The fixed
-    anchors of the problem, the first ones, are kept.
-
-    Parameters
-    ----------
-    problem, anchors
-        The problem, and the start layout.
-    seed
-        Seed of the candidates and poses.
-    survive
-        1: use the worst case over the loss of any one anchor.
+    anchors of the problem, the first ones, are kept. With `survive` 1 the worst case over the loss
+    of any one anchor counts.
     """
     rng = np.random.default_rng([seed, len(anchors), 5])
     reached = math.inf

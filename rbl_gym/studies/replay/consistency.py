@@ -30,17 +30,9 @@ _MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
 def consistency_figures(found: Innovations, recording: Recording) -> dict[str, Any]:
     """Return how well a filter predicted a log, in plain numbers.
 
-    Parameters
-    ----------
-    found
-        Innovations of the filter, arrays (K, ...).
-    recording
-        The filtered recording.
-
-    Returns
-    -------
     ``nis_per_dof`` (1 if the filter is consistent), ``log_likelihood`` (per range),
-    ``rejected_share``, ``contradicts``, and the tables of `residual_tables`.
+    ``rejected_share``, ``contradicts``, and the tables of `residual_tables`, from innovations (K,
+    ...).
     """
     ranges, used = int(recording.links.sum()), int(found.dof.sum())
     return {

@@ -17,15 +17,7 @@ _WIDE = 0.7
 def diagnose(
     recording: Recording, settings: Settings, track: Track
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return figures as in `consistency_figures`, ``causes`` of a contradiction, and notes.
-
-    Parameters
-    ----------
-    recording, settings
-        The recording, and the settings.
-    track
-        Track of the filter, with its innovations.
-    """
+    """Return figures as in `consistency_figures`, ``causes`` of a contradiction, and notes."""
     found = track.innovations
     assert found is not None
     figures = consistency_figures(found, recording)

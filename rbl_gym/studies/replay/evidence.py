@@ -62,13 +62,8 @@ class Evidence(NamedTuple):
 def evidence(trials: Sequence[Trial]) -> Evidence:
     """Return the likelihood of recordings with the same epochs and links, one per hypothesis.
 
-    It is minus infinity for a trial that cannot be filtered.
-
-    Parameters
-    ----------
-    trials
-        Recordings may differ in ranges, their standard deviations, anchors, tags, and used links.
-        Settings may differ in any field.
+    It is minus infinity for a trial that cannot be filtered. Recordings may differ in ranges, their
+    standard deviations, anchors, tags, and used links; settings in any field.
     """
     found: list[tuple[FloatArray, ...] | None] = [None] * len(trials)
     groups: dict[Any, list[int]] = {}

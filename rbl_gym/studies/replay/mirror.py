@@ -66,18 +66,10 @@ def other_pose(
 ) -> Mirror | None:
     """Return the mirror pose of a track, or None if the ranges exclude it at once.
 
-    Parameters
-    ----------
-    recording
-        The ranges; only anchors and tags with ranges are used.
-    filter
-        An iterated EKF with the recording's tags and motion.
-    range_std
-        Standard deviation of a range [m]; None: the recording's own.
-    track
-        Rotation, translation, covariance (K, ...) of the beliefs.
-    volume
-        Corners (2, 3) of the possible positions; a pose outside is not counted.
+    Only anchors and tags with ranges are used. The filter is an iterated EKF with the recording's
+    tags and motion; `range_std` [m] None: the recording's own; `track` is rotation, translation and
+    covariance (K, ...) of the beliefs; a pose outside of the corners (2, 3) of `volume` is not
+    counted.
     """
     seen = recording.links.any(axis=0)
     measured = np.flatnonzero(seen.sum(axis=1))

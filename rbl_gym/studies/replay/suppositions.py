@@ -93,12 +93,8 @@ def second_suppositions(
 ) -> Iterator[Supposition]:
     """Yield the faults whose size is estimated from the first results.
 
-    Parameters
-    ----------
-    trial, first
-        The log, and the first suppositions.
-    here, without
-        Results of the log followed by those of the first suppositions, and results of `left_out`.
+    `here` are the results of the log followed by those of the first suppositions, `without` the
+    results of `left_out`.
     """
     recording = trial.recording
     M, N = shape = recording.links.shape[1:]

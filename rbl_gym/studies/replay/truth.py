@@ -156,16 +156,10 @@ def fault_hints(
     Tested are the order and the direction of the quaternions, the unit of the positions, a time
     shift, and, alone or in addition, a rigid transform of the world frame or of the body frame.
 
-    Parameters
-    ----------
-    at
-        Function ``at(delay, rotations)`` that returns the compared poses at some epochs. `delay`,
-        in seconds, corrects the time stamps of the truth. With `rotations` the result has the
-        rotations of the file; without it has no rotations.
-    seen
-        Function that converts rotations (L, 3, 3) of the file to those that are compared.
-    planar
-        Whether the position has only x and y.
+    ``at(delay, rotations)`` returns the compared poses at some epochs: `delay`, in seconds,
+    corrects the time stamps of the truth; with `rotations` the result has those of the file,
+    otherwise none. `seen` converts rotations (L, 3, 3) of the file to those that are compared; if
+    `planar`, the position has only x and y.
     """
 
     def mended(judged: Judged) -> Judged:
