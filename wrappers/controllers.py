@@ -1,8 +1,9 @@
 """Reference policies of the tasks with a filter in the loop, to compare learned ones with.
 
-A controller is a function ``(env, rng) -> actions`` of a vector environment with one scene. It
-reads the belief and the model, never the truth. Only `greedy_with_map` knows the positions of the
-racks. Those in `MOBILE` and `SELECTION` also accept families of scenes.
+A controller is a function ``(env, rng) -> actions`` of a vector environment with one scene. `rng`
+is the Generator of those that draw random numbers; the others do not use it. A controller reads
+the belief and the model, never the truth. Only `greedy_with_map` knows the positions of the racks.
+Those in `MOBILE` and `SELECTION` also accept families of scenes.
 """
 
 from __future__ import annotations

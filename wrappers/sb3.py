@@ -44,7 +44,10 @@ class Sb3VecEnv(VecEnv):
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(f"envs must have autoreset_mode 'SameStep', got {mode}")
+            raise ValueError(
+                f"envs must have autoreset_mode 'SameStep', got {mode}: make them by "
+                "gym.make_vec(..., autoreset_mode='SameStep')"
+            )
         self.envs = envs
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         self._actions: np.ndarray | None = None
