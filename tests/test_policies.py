@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -148,6 +149,13 @@ def test_archives_that_hold_no_policy_are_refused(tmp_path, changes, message):
     with pytest.raises(ValueError, match=message) as caught:
         policies.load(path)
     assert str(caught.value).startswith(f"{path} is not a policy of rbl-gym")
+
+
+def test_a_model_of_stable_baselines3_is_named(tmp_path):
+    with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
+        archive.writestr("policy.pth", b"")
+    with pytest.raises(ValueError, match=r"a model of stable-baselines3. Convert it by.*policy_of"):
+        policies.load(tmp_path / "model.zip")
 
 
 @pytest.mark.parametrize("damage", ["empty", "text", "half", "flipped", "array"])

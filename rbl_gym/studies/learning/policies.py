@@ -206,6 +206,12 @@ def load(path: str | Path) -> AnyPolicy:
     if not zipfile.is_zipfile(data):
         raise ValueError(f"{path} is not a policy of rbl-gym: must be a .npz file of rbl-gym train")
     try:
+        with zipfile.ZipFile(data) as archive:
+            if "policy.pth" in archive.namelist():
+                raise ValueError(
+                    "it is a model of stable-baselines3. Convert it by "
+                    "rbl_gym.studies.learning.sb3_models.policy_of (docs/learners.md)"
+                )
         with np.load(data, allow_pickle=False) as file:
             meta = json.loads(str(file[_META]))
             arrays = {key: file[key].astype(float) for key in file.files if key != _META}
