@@ -317,6 +317,7 @@ def test_an_exchange_that_removes_the_mirror_image_is_suggested():
         (["--anchors", "2"], "the number of anchors must be 3 to 256, got 2"),
         (["--anchors", "2..4"], "the number of anchors must be 3 to 256, got 2"),
         (["--region", "0,0,0,20,1,1"], "region must lie inside the room"),
+        (["--region", "x=0:20,y=0:1,z=0:1"], "region must lie inside the room"),
         (["--racks", "9"], "racks must be an int from 0 to 2"),
         (["--scene", "nowhere"], "scene must be one of"),
         (["--scene", "nowhere.toml"], "rbl-gym place: nowhere.toml: No such file or directory"),
@@ -333,7 +334,8 @@ def test_what_is_wrong_is_said_in_one_line_with_status_2(options, message, capsy
 @pytest.mark.parametrize(
     "options",
     [["--anchors", "x"], ["--anchors", "6..4"], ["--anchors", "3.."], ["--region", "1,2"],
-     ["--region", "a,b,c,d,e,f"], ["--trials", "0"]],
+     ["--region", "a,b,c,d,e,f"], ["--region", "1,9,1,7,0.5,2"], ["--region", "z=0:1"],
+     ["--region", "x=3:1,y=0:1,z=0:1"], ["--trials", "0"]],
 )  # fmt: skip
 def test_what_cannot_be_read_is_a_usage_error(options, capsys):
     with pytest.raises(SystemExit, match="2"):

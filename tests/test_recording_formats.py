@@ -143,6 +143,22 @@ def test_units_of_time(tmp_path, unit, scale, start, step):
         assert said == (unit != "s" and not options)
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_unit_of_the_times_of_a_truth(tmp_path, unit, scale):
+    """Poses may be rare: the unit follows from the length of the log."""
+    rows = [f"{scale * t:.0f},{t},0,0" for t in range(30)]
+    log = read(tmp_path, many(300), truth="\n".join(["t,x,y,z", *rows]))
+    np.testing.assert_allclose(log.truth.times, np.arange(30), atol=1e-9)
+    notes = [note for note in log.report.notes if "span about as long as the ranges" in note]
+    assert len(notes) == (unit != "s")
+    assert all("set --columns truth.t=t[s]" in note for note in notes)
+    # A truth of one hour at 100 Hz contains a short log.
+    rows = [f"{0.01 * k:.2f},{k},0,0" for k in range(0, 360_000, 1000)]
+    rows = [*rows[:1], *(f"{0.01 * k:.2f},{k},0,0" for k in range(1, 500)), *rows[1:]]
+    log = read(tmp_path, many(40), truth="\n".join(["t,x,y,z", *rows]))
+    assert log.truth.times[-1] == 3590.0
+
+
 def test_unit_of_time_in_the_header(tmp_path):
     for head in ("t [ms]", "time_ms", "timestamp(ms)"):
         text = many(5, 1.0).replace("t,", f"{head},", 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,8 @@ def test_a_mirror_pose_is_named_and_the_belief_covers_it(name, anchors):
     recording = record(anchors, FLAT)
     track, result = outcome(recording, filter=name)
     assert result["mirror"]["epochs"] > 20
-    assert any("--volume" in note for note in result["notes"])
+    (note,) = [note for note in result["notes"] if "--volume" in note]
+    assert "inside what --volume" not in note
     assert result["anees"] < 1.5
     height = np.sqrt(track.covariance[10, 3:, 3:].trace())
     assert height > 0.5
@@ -187,13 +189,24 @@ def test_the_command_takes_a_volume(tmp_path, capsys):
     assert main([*command, "--html", str(page)]) == 0
     assert "a mirror pose behind" in capsys.readouterr().out
     assert "a mirror pose behind" in page.read_text(encoding="utf-8")
-    for option in ("--below-anchors", "--volume=-1,5,-1,4,0,2", "--volume=,,,,,2"):
+    for option in ("--below-anchors", "--volume=-1,5,-1,4,0,2", "--volume=,,,,,2", "--volume=z=:2"):
         assert main([*command, option]) == 0
         assert "mirror" not in capsys.readouterr().out
-    for wrong in ("--volume=1,2", "--volume=a,b,c,d,e,f"):
+    assert main([*command, "--volume", "x=-1:5,z=0:9"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "Both are inside what --volume or --below-anchors allows. State where" in shown
+    # Both answers, for the user to choose.
+    limits = re.findall(r"--volume z=(\S*?)\)", shown)
+    assert [limit.count(":") for limit in limits] == [1, 1]
+    assert main([*command, f"--volume=z={limits[0]}"]) == 0
+    assert "mirror" not in capsys.readouterr().out
+    for wrong in ("1,2", "a,b,c,d,e,f", "z=2", "z=1:2,z=3:4", "w=1:2", "z=a:2"):
         with pytest.raises(SystemExit):
-            main([*command, wrong])
-        assert "must be xmin,xmax" in capsys.readouterr().err
+            main([*command, f"--volume={wrong}"])
+        assert "must be x=MIN:MAX" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*command, "--volume=z=2:1"])
+    assert "z must have MIN below MAX" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

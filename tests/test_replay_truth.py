@@ -76,6 +76,24 @@ def test_gaps_in_both_are_named():
     check_overlap(truth._replace(times=truth.times - 0.5), ranges, 0.5)
 
 
+def test_gaps_of_the_ranges_are_counted():
+    recording, track = pair(Truth(*moving(0.1)))
+    settings = replay.Settings()
+    assert replay.track_figures(recording, track, None, settings)["gaps"]["count"] == 0
+    kept = np.ones(100, dtype=bool)
+    kept[20:35] = kept[60:91] = False
+    fewer = replay.Track(*(field[kept] for field in track[:4]))
+    log = recording.part(kept)
+    found = replay.track_figures(log, fewer, None, settings)
+    assert found["gaps"] == {
+        "count": 2,
+        "longest_s": pytest.approx(3.2),
+        "longest_at_s": pytest.approx(5.9),
+    }
+    said = "Note: the log has 2 gaps without ranges; the longest lasts 3.2 s from t = 5.9 s."
+    assert said in found["notes"]
+
+
 def test_no_common_time_names_what_lies_between():
     times, rotation, place = moving(0.1)
     with pytest.raises(

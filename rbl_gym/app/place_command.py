@@ -14,10 +14,12 @@ from rbl_gym.app.plan_options import (
     write_report,
 )
 from rbl_gym.app.terminal import (
+    BOX,
     add_html,
     add_json,
     add_plot,
     add_trials,
+    box,
     check_html,
     natural,
     positive,
@@ -96,8 +98,9 @@ def add_place(commands: Any) -> None:
     place.add_argument(
         "--region",
         type=_region,
-        metavar="x0,y0,z0,x1,y1,z1",
-        help="work region, metres; write --region=-1,... if the first number is negative",
+        metavar=BOX,
+        help="work region, metres; also its corners x0,y0,z0,x1,y1,z1 (write --region=-1,... if "
+        "the first number is negative)",
     )
     add_trials(place, 500, "number of trials of the check with filters")
     add_plot(place, "with maps over the plan, and layouts")
@@ -217,11 +220,21 @@ def _numbers(text: str) -> range:
 
 
 def _region(text: str) -> tuple[list[float], list[float]]:
-    """Parse six numbers as two corners."""
+    """Parse `BOX`, or six numbers, as two corners."""
+    if (pairs := box(text)) is not None:
+        if any(None in pair for pair in pairs):
+            raise argparse.ArgumentTypeError(f"must have six limits, {BOX}, got {text!r}")
+        return [float(pair[0] or 0) for pair in pairs], [float(pair[1] or 0) for pair in pairs]
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) != 6:
-        raise argparse.ArgumentTypeError(f"must be six numbers x0,y0,z0,x1,y1,z1, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"must be {BOX}, or the corners x0,y0,z0,x1,y1,z1, got {text!r}"
+        )
+    if not all(low <= high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise argparse.ArgumentTypeError(
+            f"must be the corner x0,y0,z0 and the opposite, larger one, or {BOX}, got {text!r}"
+        )
     return numbers[:3], numbers[3:]

@@ -15,10 +15,12 @@ from rbl_gym.app.sensor_options import (
     told_clocks,
 )
 from rbl_gym.app.terminal import (
+    BOX,
     FILTER_HELP,
     add_html,
     add_json,
     add_plot,
+    box,
     check_html,
     print_files,
     progress,
@@ -71,10 +73,10 @@ def _add_knowledge(group: Any) -> None:
     group.add_argument(
         "--volume",
         type=_volume,
-        metavar="xmin,xmax,ymin,ymax,zmin,zmax",
+        metavar=BOX,
         help="where the body's origin may be, metres; separates a pose from its mirror image. "
-        "Leave a number empty for no limit, as in --volume=,,,,,1.8; write --volume=-1,... "
-        "if the first number is negative",
+        "An axis or a limit may be left out: --volume z=:1.8. Also xmin,xmax,ymin,ymax,zmin,zmax, "
+        "with empty numbers for no limit",
     )
     group.add_argument(
         "--below-anchors",
@@ -353,13 +355,15 @@ def _start(text: str) -> tuple[float, ...]:
 
 
 def _volume(text: str) -> tuple[float | None, ...]:
-    """Parse six numbers separated by commas, some of which may be empty."""
+    """Parse `BOX`, or its six numbers separated by commas, some of which may be empty."""
+    if (pairs := box(text)) is not None:
+        return tuple(limit for pair in pairs for limit in pair)
     try:
         limits = [float(part) if part.strip() else None for part in text.split(",")]
     except ValueError:
         limits = []
     if len(limits) != 6:
         raise argparse.ArgumentTypeError(
-            f"must be xmin,xmax,ymin,ymax,zmin,zmax in metres, got {text!r}"
+            f"must be {BOX}, or xmin,xmax,ymin,ymax,zmin,zmax, in metres, got {text!r}"
         )
     return tuple(limits)

@@ -157,6 +157,34 @@ def _picture(text: str) -> str:
     return text
 
 
+BOX = "x=MIN:MAX,y=MIN:MAX,z=MIN:MAX"
+
+
+def box(text: str) -> list[tuple[float | None, float | None]] | None:
+    """Parse `BOX` as three pairs, None where a limit or an axis is left out; None: another form."""
+    if "=" not in text:
+        return None
+    limits: dict[str, tuple[float | None, float | None]] = {}
+    for part in text.split(","):
+        axis, _, ends = part.strip().partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            pair = tuple(float(end) if end.strip() else None for end in (low, high))
+        except ValueError:
+            colon = ""
+        if not colon or axis not in ("x", "y", "z") or axis in limits:
+            raise argparse.ArgumentTypeError(
+                f"must be {BOX} in metres, each axis once, got {text!r}"
+            )
+        limits[axis] = pair[0], pair[1]
+    for axis, (low, high) in limits.items():
+        if low is not None and high is not None and low > high:
+            raise argparse.ArgumentTypeError(
+                f"{axis} must have MIN below MAX, got {low:g}:{high:g}"
+            )
+    return [limits.get(axis, (None, None)) for axis in "xyz"]
+
+
 def print_files(**files: str | None) -> None:
     """Print the written files, one per line: ``picture: out/x.png``."""
     for label, path in files.items():

@@ -10,11 +10,13 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 # Largest usual spacing of epochs (s), and latest start of a log (s), in this unit.
 _LONGEST_STEP_S = {"s": 10.0, "ms": 1.0, "us": 1.0}
 _LATEST_S = 1e11
+# Smallest usual spacing of the poses of a truth (s).
+_SHORTEST_STEP_S = 5e-4
 # Seconds since 1970 of the years 2001 to 2065: the size of such stamps determines their unit.
 _DATES_S = (1e9, 3e9)
 _LONGEST_DATED_STEP_S = 60.0
@@ -45,6 +47,22 @@ def dated_unit(stamps: FloatArray) -> str | None:
         if _DATES_S[0] <= start * scale <= _DATES_S[1] and step * scale <= _LONGEST_DATED_STEP_S:
             return name
     return None
+
+
+def unit_by_length(stamps: FloatArray, times: FloatArray | None) -> str:
+    """Return the unit in which stamps (L,) span about as long as a log (K,) in seconds; else s.
+
+    Logs of one run have similar lengths.
+    """
+    if times is None or len(stamps) < 2:
+        return "s"
+    length, step = float(np.ptp(times)), float(np.median(np.diff(np.sort(stamps))))
+    for name, scale in TIME_UNITS.items():
+        if step * scale < _SHORTEST_STEP_S:
+            break
+        if 0.2 * length < float(np.ptp(stamps)) * scale < 5 * length:
+            return name
+    return "s"
 
 
 def found_unit(stamps: FloatArray) -> tuple[str, str]:
@@ -78,7 +96,7 @@ def _words(unit: str, step: float) -> str:
     if unit == "s":
         return ""
     return (
-        f"times are read as {_WORDS[unit]}, as they are {step:.6g} apart (median); set the time "
+        f"times are read as {WORDS[unit]}, as they are {step:.6g} apart (median); set the time "
         "unit if this is wrong"
     )
 

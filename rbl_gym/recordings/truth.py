@@ -12,7 +12,7 @@ from rbl_gym import motion
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.report import Said
-from rbl_gym.recordings.stamps import dated_unit
+from rbl_gym.recordings.stamps import WORDS, dated_unit, unit_by_length
 from rbl_gym.recordings.tables import AS_NAMED, AnyPath, Source, Table, read_table
 from rbl_gym.recordings.text import is_number
 
@@ -137,7 +137,15 @@ def read_truth(
     unit = table.units.get("t")
     if unit is None and is_number(table.columns["t"][0]):
         # Poses may be rare, so their spacing does not distinguish seconds from milliseconds.
-        unit = dated_unit(table.numbers("t")) or "s"
+        values = table.numbers("t")
+        unit = dated_unit(values)
+        if unit is None and (unit := unit_by_length(values, times)) != "s":
+            told = table.source.given(t=f"{table.name('t')}[s]")
+            said.note(
+                table.path,
+                f"times are read as {WORDS[unit]}, as they then span about as long as the ranges; "
+                f"if they are seconds, set --columns {told}",
+            )
     stamps, _ = table.seconds(unit)
     table.check(np.diff(stamps, prepend=-np.inf) > 0, "t", "time must increase from row to row")
     return Truth(stamps, rotation, translation, planar, form)

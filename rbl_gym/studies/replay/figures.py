@@ -29,6 +29,8 @@ __all__ = ["track_figures"]
 
 # The truth is at the mirror pose if its mean square error is below this share of the track's.
 _NEARER = 0.25
+# Epochs further apart than this (s), and than this multiple of the median, leave a gap.
+_GAP_S, _GAP_STEPS = 1.0, 5.0
 # Number of epochs that is sufficient to find a fault of the truth.
 _ENOUGH = 1000
 
@@ -50,6 +52,7 @@ def track_figures(
         "epochs": len(track.times),
         "duration_s": float(track.times[-1] - track.times[0]),
         "links": int(recording.links.sum()),
+        "gaps": _gaps(track.times),
     }
     result |= _notes(recording, track, found, settings)
     result |= _with_reading(recording, result["notes"])
@@ -114,6 +117,32 @@ def _comparison(recording: Recording, found: TrackErrors, settings: Settings) ->
     return result
 
 
+def _gaps(times: FloatArray) -> dict[str, Any]:
+    """Return the number of gaps without ranges, and length and start of the longest."""
+    steps = np.diff(times)
+    shortest = max(_GAP_S, _GAP_STEPS * float(np.median(steps))) if len(steps) else _GAP_S
+    gaps = np.flatnonzero(steps > shortest)
+    if not len(gaps):
+        return {"count": 0, "longest_s": None, "longest_at_s": None}
+    longest = gaps[steps[gaps].argmax()]
+    return {
+        "count": len(gaps),
+        "longest_s": float(steps[longest]),
+        "longest_at_s": float(times[longest]),
+    }
+
+
+def _gap_note(gaps: dict[str, Any]) -> list[str]:
+    count = gaps["count"]
+    if not count:
+        return []
+    what = "a gap without ranges; it" if count == 1 else f"{count} gaps without ranges; the longest"
+    return [
+        f"Note: the log has {what} lasts {gaps['longest_s']:.1f} s from "
+        f"t = {gaps['longest_at_s']:.10g} s."
+    ]
+
+
 def _with_reading(recording: Recording, notes: list[str]) -> dict[str, Any]:
     """Return the figures of reading the log; its notes come first."""
     report = recording.report
@@ -133,6 +162,7 @@ def _notes(
     """Return the figures of the mirror pose and of known directions, and notes for the reader."""
     result: dict[str, Any] = {}
     notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
+    notes += _gap_note(_gaps(track.times))
     count = len(track.times)
     if track.other is not None and np.isfinite(track.other.log_odds[-1]):
         alive = track.other.alive
@@ -142,7 +172,8 @@ def _notes(
             "distance_m": float(np.median(apart[alive])),
             "log_odds": float(track.other.log_odds[alive][-1]),
         }
-        notes.append(_mirror_note(result["mirror"], count))
+        told = settings.knowledge.volume is not None or settings.knowledge.below_anchors
+        notes.append(_mirror_note(result["mirror"], count, track, told))
     known, unknown = known_figures(recording, track)
     result |= known
     # If there is a mirror pose, its own note is sufficient.
@@ -181,12 +212,26 @@ def _truth_at_mirror(
     return bool(near < _NEARER * far)
 
 
-def _mirror_note(found: dict[str, Any], count: int) -> str:
+def _mirror_note(found: dict[str, Any], count: int, track: Track, told: bool) -> str:
+    assert track.other is not None
     as_well = "better" if found["log_odds"] > DECIDED else "as well"
+    alive = track.other.alive
+    here, there = (
+        np.median(a[alive], axis=0) for a in (track.translation, track.other.translation)
+    )
+    axis = int(np.abs(there - here).argmax())
+    name, limit = "xyz"[axis], f"{0.5 * (here[axis] + there[axis]):.2g}"
+    either = " or ".join(
+        f"at {name} = {place:.1f} m (--volume {name}={ends})"
+        for place, ends in zip(
+            sorted((here[axis], there[axis])), (f":{limit}", f"{limit}:"), strict=True
+        )
+    )
+    given = "Both are inside what --volume or --below-anchors allows. " if told else ""
     return (
         f"WARNING: a mirror pose behind the anchors' plane, {found['distance_m']:.2f} m away, "
         f"explains the ranges {as_well} in {found['epochs']} of {count} epochs. The belief covers "
-        "both. Say where the body is: --below-anchors or --volume."
+        f"both. {given}State where the body is: {either}."
     )
 
 
