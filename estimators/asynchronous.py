@@ -208,7 +208,10 @@ class Asynchronous:
     def state(
         self, stream: Stream, time: float | None = None, twist: ArrayLike | None = (0.0,) * 6
     ) -> Any:
-        """Return the filter's state at a time (s) not before the newest range; None: at it."""
+        """Return the filter's state at a time, seconds, at or after the newest range.
+
+        None: at the newest range.
+        """
         newest = stream.checkpoints[-1]
         if time is None:
             return newest.state

@@ -79,7 +79,7 @@ def length(vector: FloatArray) -> FloatArray:
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the normalised estimation error squared (...), ``e^T P^-1 e``.
 
-    Mean 6 if consistent.
+    For a consistent belief its mean is n: 6 for a pose.
     """
     if covariance.shape[-2:] != (error.shape[-1],) * 2:
         raise ValueError(

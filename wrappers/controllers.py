@@ -40,7 +40,7 @@ def random_velocities(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> 
 
 
 def ring(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Keep a ring around the estimate, about as wide as the vehicle is deep."""
+    """Keep a ring around the estimate, with the vehicle's depth as radius (two craft: a quarter)."""
     pair = env.scene.n_anchors == 2
     return _towards(env, _around(env, PAIR_RING_DEPTHS if pair else RING_DEPTHS, 0.0))
 
@@ -93,7 +93,7 @@ def _ordered(env: MobileAnchorsVectorEnv, velocity: FloatArray) -> np.ndarray:
 
 
 def receding_horizon(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Plan six steps ahead by the cross-entropy method on the predicted bound; do the first.
+    """Plan six steps by the cross-entropy method on the predicted bound; return the first.
 
     The vehicle is predicted with its present twist. A plan is a velocity of each craft at each
     step. The orbit is among the first samples.

@@ -66,7 +66,7 @@ class _Scored(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class IteratedEkfBank:
-    """A bank of iterated EKFs on raw ranges; see the module.
+    """A bank of iterated EKFs on raw ranges: several poses, each with its probability.
 
     Parameters
     ----------

@@ -128,8 +128,8 @@ def adjust(
     model
         Biases, and whether the problem is planar.
     known
-        (M,) mask of anchors fixed at the start; default none. Degrees of freedom of the frame that
-        these leave free are fixed by zero mean shift and rotation of the anchors from the start.
+        (M,) mask of anchors that keep their start positions; default none. If they do not
+        determine the frame, the anchors have no mean shift and no mean rotation from the start.
     pairs
         (M, M) ranges between anchors, metres, 0 for none; both directions are averaged.
     lasting
@@ -143,7 +143,7 @@ def adjust(
     Notes
     -----
     Levenberg-Marquardt with iterated weights. A body with one tag has a position and no rotation.
-    Triggs et al., "Bundle adjustment: a modern synthesis", 2000, is the method, for cameras.
+    Triggs et al., "Bundle adjustment: a modern synthesis", 2000, describes it for cameras.
     """
     ranges = (
         check_array("ranges", ranges, ("K", "M", "N")) if np.size(ranges) else np.asarray(ranges)

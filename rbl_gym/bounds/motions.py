@@ -27,7 +27,7 @@ class Motion(Protocol):
     """The motion of the interval that ends at an epoch."""
 
     def checked(self) -> Motion:
-        """Return the same with arrays; raise ValueError for invalid arguments."""
+        """Return the motion with its values as arrays; raise ValueError if one is invalid."""
         ...
 
     @property

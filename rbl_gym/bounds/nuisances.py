@@ -64,7 +64,7 @@ class RangeEpoch(NamedTuple):
     links: ArrayLike | None = None
 
     def checked(self) -> RangeEpoch:
-        """Return the same with float64 arrays; raise ValueError for invalid arguments."""
+        """Return the epoch with float64 arrays; raise ValueError for invalid arguments."""
         anchors = check_array("anchors", self.anchors, ("M", 3))
         tags = check_array("tags", self.tags, ("N", 3))
         rotation = rotations.check_rotation("rotation", self.rotation)
@@ -97,7 +97,7 @@ class Nuisances:
     Raises
     ------
     ValueError
-        If a value is not one of these.
+        If `offset`, `bias` or `groups` is none of the above, or a deviation is negative.
     """
 
     offset: str | None = None
@@ -141,7 +141,7 @@ class Nuisances:
     def faded(self, J: FloatArray, biases: int, dt: ArrayLike) -> FloatArray:
         """Return the joint information (..., n, n) after `dt` seconds.
 
-        Biases (last states) decorrelate.
+        The biases, which are the last states, decorrelate in this time.
         """
         if self.bias is None or self.bias.time_s is None or biases == 0:
             return J

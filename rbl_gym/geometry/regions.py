@@ -66,7 +66,7 @@ class Faces(NamedTuple):
 
 
 class Region(Protocol):
-    """Interface of regions; `faces` is a field, or computed once."""
+    """Interface of regions of legal anchor positions. `faces` is a field or a cached property."""
 
     if TYPE_CHECKING:
 
@@ -229,8 +229,8 @@ class Walls(Region):
     def place(self, action: FloatArray) -> FloatArray:
         """Return the point where the ray from the room centre along the action meets a surface.
 
-        A ray that points down ends at the height of the floor; one to the floor, at the nearest
-        legal point.
+        A ray that would meet a wall below the floor ends on it at the height of the floor. A ray
+        straight down gives the nearest legal point.
         """
         return place_on_walls(action, *self._corners)
 
@@ -319,7 +319,7 @@ class Shell(Region):
         return np.where(radius > 0, scaled, self.inner_m * np.eye(3)[0])
 
     def place(self, action: FloatArray) -> FloatArray:
-        """Return points in the direction of actions (x for zero); their length sets the radius."""
+        """Return points in the direction of actions (zero: along x); the length sets the radius."""
         action = _cut(action)
         length = np.linalg.norm(action, axis=-1, keepdims=True)
         far = length > 1e-150  # The squares of shorter ones underflow.

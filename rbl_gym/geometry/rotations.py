@@ -309,7 +309,7 @@ def _nearest(M: FloatArray) -> FloatArray:
 def error(Q_hat: ArrayLike, Q: ArrayLike) -> FloatArray:
     """Return the global rotation error ``w`` (..., 3), ``Q_hat = exp(w) Q``.
 
-    Its norm is the angle.
+    Its norm is the angle between the two rotations.
     """
     return kernel(log)(np.asarray(Q_hat) @ np.swapaxes(np.asarray(Q), -1, -2))
 

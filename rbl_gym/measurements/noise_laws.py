@@ -28,7 +28,7 @@ class NoiseLaw(Protocol):
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Return the variance of each range [m^2], (..., M, N).
 
-        (..., M, 1) if common to the tags.
+        The shape is (..., M, 1) if the variance is the same for all tags.
         """
         ...
 

@@ -140,9 +140,9 @@ def refresh(
     rng
         Draws the candidates.
     each
-        Number of candidates at each of some distances around the anchor, and of candidates from
-        anywhere. They are projected onto the region, so that those near an edge may lie on the
-        adjacent face.
+        Number of candidates at each of several distances from the anchor, and number of
+        candidates from the whole region. They are projected onto the region, so that those near
+        an edge may lie on the adjacent face.
 
     Returns
     -------
@@ -239,7 +239,7 @@ def evaluated(bound: Bound, points: FloatArray) -> State:
 
 
 def occupied(points: FloatArray, candidates: FloatArray) -> BoolArray:
-    """Return the pairs (..., M, C) of which the candidate has an anchor already."""
+    """Return which pairs (..., M, C) have a candidate that is already used by an anchor."""
     there = (points[..., :, None, :] == candidates[..., None, :, :]).all(axis=-1)
     return np.broadcast_to(there.any(axis=-2, keepdims=True), there.shape)
 

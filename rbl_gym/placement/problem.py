@@ -148,7 +148,7 @@ class PlacementTask:
 
     @functools.cached_property
     def rack_limits(self) -> tuple[FloatArray, FloatArray]:
-        """Minimum (6,) and span of a rack's x, y, shorter and longer half size, 0, half height."""
+        """Return minimum and span (6,) of a rack: x, y, half width and length, 0, half height."""
         low, high = self.scene.anchor_region.bounds()
         x, y, _ = high - low
         least = np.array([low[0] + 0.15 * x, low[1] + 0.15 * y, 0.2, 1.0, 0.0, 0.6])
@@ -280,8 +280,8 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     """Return the score (...) of layouts (..., M, 3) in metres: small is good.
 
     The score is the root mean square over the poses of b, ``b^2 = mean_n tr(J_n P J_n^T)`` with ``P
-    = (F + prior)^-1``. The prior keeps the scores of layouts without sight comparable. A proper
-    inverse keeps coincident anchors from winning.
+    = (F + prior)^-1``. With the prior, layouts without sight have finite scores. A pseudo-inverse
+    is not used, because it would favour coincident anchors.
     """
     anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
     return score_of_checked(task, context, anchors)

@@ -53,7 +53,7 @@ class Sample(NamedTuple):
         return np.flatnonzero(np.repeat(rank % step == first, self.turns))
 
     def part(self, index: np.ndarray) -> Sample:
-        """Return the poses of indices; the total weight of each zone does not change."""
+        """Return the poses with these indices; the total weight of each zone does not change."""
         rotation, places, weight, prior, zone = (field[index] for field in self[:5])
         arrays = Sample(rotation, places, weight, prior, zone, self.turns)
         whole = np.bincount(self.zone, self.weight)

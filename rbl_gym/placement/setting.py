@@ -108,7 +108,7 @@ class Setting(NamedTuple):
         return self._replace(sample=self.sample._replace(prior=self.told(fixed)))
 
     def part(self, index: np.ndarray) -> Setting:
-        """Return the setting for the poses of indices."""
+        """Return the setting with the poses of these indices."""
         return self._replace(sample=self.sample.part(index))
 
 

@@ -59,7 +59,7 @@ class Scenery(NamedTuple):
         Legal positions (..., C, 3), their normals, and the information fractions (..., P, C) of
         their links. C may be 0.
     shown
-        Number of candidates, the first ones, of which there are tokens; None: all.
+        Only this many candidates, the first ones, have tokens; None: all.
     """
 
     kind: int

@@ -1,7 +1,7 @@
 """Compute bounds along a track with an inertial sensor, a better survey or calibrated links.
 
 The posterior Cramer-Rao bound is computed on one set of episodes for each model of the motion and
-each set of unknowns. No filter is run: the bound is the limit of the best one.
+each set of unknowns. No filter is run: no filter can be more accurate than the bound.
 """
 
 from __future__ import annotations

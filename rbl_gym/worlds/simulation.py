@@ -41,8 +41,8 @@ class Episode(NamedTuple):
     rotation, translation
         True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3).
     twists
-        Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
-        unless the prior is older than it.
+        Known twist of the interval that ends at each epoch, (..., T + 1, 6). At epoch 0 it is
+        zero, unless the prior refers to an earlier time.
     normals, uniforms
         Random numbers of the ranges (..., T + 1, M, N), and of the links (..., T + 1, 2, M, N),
         None if the links need none.

@@ -277,7 +277,7 @@ def plane(state: State) -> tuple[FloatArray, FloatArray]:
 
 
 def cut(state: State, **fields: Any) -> State:
-    """Change fields of the `Slice`; the body moves onto it."""
+    """Change fields of the `Slice`; the body moves onto the new slice."""
     changed = dataclasses.replace(state, slice=state.slice._replace(**fields))
     return place_body(changed, state.body)
 

@@ -1,4 +1,4 @@
-"""A network over sets in numpy, equal for every element, whatever their number and order."""
+"""A network over sets in NumPy: one function of every element, in any number and order."""
 
 from __future__ import annotations
 

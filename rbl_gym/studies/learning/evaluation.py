@@ -77,7 +77,7 @@ def evaluate(
     ----------
     task
         A task, its name (`rl_tasks.TASKS`), or an environment of `gym.make` or `gym.make_vec` with
-        one of the ids of these tasks. Its arguments are used, itself is not changed.
+        one of the ids of these tasks. Its arguments are used; it is not changed.
     policies
         One policy or a dict by label: anything that `own_policies.policy_like` takes, for example a
         function ``observation -> actions``, where both are arrays of all worlds. A placement task

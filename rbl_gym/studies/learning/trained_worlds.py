@@ -38,7 +38,7 @@ def common_worlds(task: str, policies: Mapping[str, PolicyLike]) -> dict[str, An
     Parameters
     ----------
     task
-        Name of the task. Policies of other tasks have no say.
+        Name of the task. Policies of other tasks are ignored.
     policies
         Policies by label.
 

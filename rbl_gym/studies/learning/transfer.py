@@ -236,7 +236,7 @@ def transfer_layouts(
 def track_layouts(
     groups: list[Layouts], filters: list[str], repeats: int, seed: int, advance: Advance = silent
 ) -> dict[str, Any]:
-    """Return scores and filter errors of layouts. All layouts meet the same bodies.
+    """Return scores and filter errors of layouts. All layouts have the same bodies.
 
     Parameters
     ----------

@@ -47,8 +47,8 @@ class Question:
     Parameters
     ----------
     numbers
-        Numbers of anchors; all but the last are only used for the table over the number. With
-        `fewest`, the candidates for the smallest number.
+        Numbers of anchors. The result is for the last one; the others are only rows of the table
+        by number. With `fewest`: the numbers to try.
     fewest
         Find the smallest number that meets the requirements of all zones.
     layout, names

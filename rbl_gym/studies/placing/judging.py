@@ -66,7 +66,7 @@ class Judged(NamedTuple):
 
     @property
     def failing(self) -> int | None:
-        """Return the index of the critical anchor: without it the fewest positions are within."""
+        """Return the critical anchor: without it the fewest positions are within the limits."""
         if self.without is None:
             return None
         if not self.asks:

@@ -38,7 +38,6 @@ def survey_rows(
         The placement problem, and the anchor positions (M, 3).
     judged
         Results of its zones, with the evaluated positions.
-        Its zones, with the evaluated positions.
 
     Returns
     -------
