@@ -40,7 +40,7 @@ def random_velocities(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> 
 
 
 def ring(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Keep a ring around the estimate, with the vehicle's depth as radius (two craft: a quarter)."""
+    """Keep a ring around the estimate, its radius the vehicle's depth (two craft: a quarter)."""
     pair = env.scene.n_anchors == 2
     return _towards(env, _around(env, PAIR_RING_DEPTHS if pair else RING_DEPTHS, 0.0))
 

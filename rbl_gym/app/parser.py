@@ -16,6 +16,12 @@ _CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")
 class _Help(argparse.HelpFormatter):
     """Help that never breaks a name at its hyphens, such as --metres-per-pixel."""
 
+    def add_argument(self, action: argparse.Action) -> None:
+        """Leave room for the longest command, whose indentation argparse does not count."""
+        super().add_argument(action)
+        if isinstance(action, argparse._SubParsersAction):
+            self._action_max_length += self._indent_increment
+
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
 
