@@ -275,8 +275,9 @@ def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) ->
 
 def did_you_mean(value: Any, choices: Iterable[str]) -> str:
     """Return ``"; did you mean 'iekf'?"`` if a choice is close to `value`, else ``""``."""
-    known = {choice.lower(): choice for choice in choices}
-    near = difflib.get_close_matches(str(value).lower(), list(known), n=2, cutoff=0.7)
+    known, name = {choice.lower(): choice for choice in choices}, str(value).lower()
+    near = difflib.get_close_matches(name, list(known), n=2, cutoff=0.7)
+    near = near or [choice for choice in known if len(name) > 2 and choice.startswith(name)][:2]
     return f"; did you mean {' or '.join(repr(known[name]) for name in near)}?" if near else ""
 
 

@@ -1,6 +1,7 @@
 """The command line: errors of one line, options named as the user typed them, whole words."""
 
 import re
+from typing import Any
 
 import pytest
 
@@ -75,7 +76,8 @@ def test_help_fits_80_columns_and_breaks_no_word(command, monkeypatch, capsys):
 
 @pytest.mark.parametrize("command", cli._COMMANDS)
 def test_every_option_has_a_help_and_numbers_have_a_default(command):
-    parser = cli._parser(command)._subparsers._group_actions[0].choices[command]
+    parsers: Any = cli._parser(command)._subparsers
+    parser = parsers._group_actions[0].choices[command]
     for action in parser._actions:
         assert action.help, action.dest
         default = action.default

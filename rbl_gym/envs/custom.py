@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rbl_gym.checks import all_finite, imported
+from rbl_gym.checks import all_finite, did_you_mean, imported
 
 # Values without bounds. These bounds are finite and never reached.
 FAR = 1e9
@@ -28,7 +28,7 @@ def chosen_view(observation: Any, names: tuple[str, ...]) -> tuple[str, Any]:
         return "own", imported("observation", observation)
     raise ValueError(
         f"observation must be one of {', '.join(map(repr, names))}, 'module:function' or a "
-        f"function, got {observation!r:.80}"
+        f"function, got {observation!r:.80}{did_you_mean(observation, names)}"
     )
 
 

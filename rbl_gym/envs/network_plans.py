@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import check_count, check_number
+from rbl_gym.checks import check_count, check_number, did_you_mean
 from rbl_gym.networks.bounds import Sensing
 from rbl_gym.worlds import laws
 
@@ -155,7 +155,7 @@ class NetworkFamily:
                 if name not in _NAMES:
                     raise ValueError(
                         f"scenes[{index}] must only have the fields {', '.join(_NAMES)}, "
-                        f"got {name!r:.80}"
+                        f"got {name!r:.80}{did_you_mean(name, _NAMES)}"
                     )
             for one in laws.corners(member, f"scenes[{index}]"):
                 self._made(index, one)

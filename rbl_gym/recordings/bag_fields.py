@@ -87,7 +87,7 @@ def _special(path: str) -> Getter:
         "@index": lambda _: _INDEX,
     }
     if path not in known:
-        raise ValueError(f"{path!r} must be one of {[*known]}")
+        raise ValueError(f"{path!r} must be one of {', '.join(known)}")
     return known[path]
 
 

@@ -159,7 +159,9 @@ class Values:
             time = self._time_path(received.message)
             self._unit = "ns" if time == "@bag" else table.get("time_unit", "s")
             if self._unit not in _TIME_UNITS:
-                raise ValueError(f"time_unit must be one of {[*_TIME_UNITS]}, got {self._unit!r}")
+                raise ValueError(
+                    f"time_unit must be one of {', '.join(_TIME_UNITS)}, got {self._unit!r}"
+                )
             self._getters = [_getter(path) for path in (time, *where, *(table[k] for k in keys))]
         self.messages += 1
         for stamp, *values in bag_fields.rows(received, self._getters):
@@ -207,7 +209,7 @@ class Values:
         if recorded and lasts and not 1 / _ODD < lasts / recorded < _ODD:
             raise ValueError(
                 f"times of the messages span {lasts:g} s, but the recording lasts {recorded:g} s: "
-                f"time_unit must be another one of {[*_TIME_UNITS]}, got {self._unit!r}"
+                f"time_unit must be another one of {', '.join(_TIME_UNITS)}, got {self._unit!r}"
             )
 
 

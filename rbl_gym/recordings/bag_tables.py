@@ -58,7 +58,7 @@ def make_tables(
 def _ranges(rows: Sequence[Row], table: dict[str, Any]) -> Tables:
     unit = table.get("unit", "m")
     if unit not in UNITS:
-        raise ValueError(f"[ranges] unit must be one of {[*UNITS]}, got {unit!r}")
+        raise ValueError(f"[ranges] unit must be one of {', '.join(UNITS)}, got {unit!r}")
     dropped: Counter[str] = Counter()
     body = {str(tag) for tag in table.get("tags", ())}
     kept: dict[tuple[int, str, str], dict[str, Any]] = {}

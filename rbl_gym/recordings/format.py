@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+from rbl_gym.checks import check_one_of
 from rbl_gym.measurements.offsets import check_offset
 from rbl_gym.recordings.stamps import TIME_UNITS
 from rbl_gym.recordings.tables import METRES, AnyPath, Source
@@ -138,8 +139,8 @@ class Format:
     def __post_init__(self) -> None:
         check_offset(self.offset)
         for name, known in (("time_unit", [*TIME_UNITS, "iso"]), ("unit", [*METRES])):
-            if getattr(self, name) not in (None, *known):
-                raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
+            if getattr(self, name) is not None:
+                check_one_of(name, getattr(self, name), known)
         for name in ("columns", "where"):
             for key, value in getattr(self, name).items():
                 file = key.partition(".")[0] if "." in key else "ranges"

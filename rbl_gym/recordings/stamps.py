@@ -33,7 +33,7 @@ def seconds_per(unit: str) -> float:
     ValueError if `unit` is not one of s, ms, us, ns.
     """
     if unit not in TIME_UNITS:
-        raise ValueError(f"time unit must be one of {[*TIME_UNITS, 'iso']}, got {unit!r}")
+        raise ValueError(f"time unit must be one of {', '.join(TIME_UNITS)}, iso, got {unit!r}")
     return TIME_UNITS[unit]
 
 

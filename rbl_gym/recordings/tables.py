@@ -111,7 +111,7 @@ class Table(NamedTuple):
         if unit and unit not in known:
             raise ValueError(
                 f"{self.path}, line {self.header_line}, column {self.name(column)!r}: unit must be "
-                f"one of {[*known]}, got {unit!r}"
+                f"one of {', '.join(known)}, got {unit!r}"
             )
         return unit
 

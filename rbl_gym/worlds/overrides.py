@@ -67,8 +67,8 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
     if "kind" not in value:
         if not dataclasses.is_dataclass(old):
             raise ValueError(
-                f"{path} must be one value, got the dict {dict(value)!r:.80} (values to draw from "
-                "are allowed only in scenes)"
+                f"{path} must be one value, got the dict {dict(value)!r:.80} (only members of "
+                "scenes may have laws: uniform, log-uniform, integers, choice, repeat)"
             )
         return replace(old, value, path)
     if not kinds:
