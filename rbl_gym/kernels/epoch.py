@@ -14,6 +14,7 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper, inlined
 from rbl_gym.kernels.noise_laws import sample
+from rbl_gym.kernels.workspace import workspace
 
 
 @gufunc("(d,d),(d),(t,s),(t,s),(s),(),(e)->(e,d,d),(e,d)")
@@ -25,14 +26,15 @@ def walk(
 
     std (6,) is that of the noise after 1 s. `like` (T + 1,) only defines the shapes of the results.
     """
-    turn, share = np.empty((3, 3)), np.empty(6)
+    turn, now, after = workspace((3, 3)), workspace((3, 3)), workspace((3, 3))
+    share = workspace((6,))
     for i in range(6):
         share[i] = std[i] / math.sqrt(dt)
     x = y = z = 0.0
     for i in range(3):
         translations_of[0, i] = translation[i]
         for j in range(3):
-            rotations_of[0, i, j] = rotation[i, j]
+            now[i, j] = rotations_of[0, i, j] = rotation[i, j]
     for k in range(twists.shape[0]):
         rotations.exp(
             (normals[k, 0] * share[0] + twists[k, 0]) * dt,
@@ -40,7 +42,10 @@ def walk(
             (normals[k, 2] * share[2] + twists[k, 2]) * dt,
             turn,
         )
-        rotations.compose(turn, rotations_of[k], rotations_of[k + 1])
+        rotations.compose(turn, now, after)
+        for i in range(3):
+            for j in range(3):
+                now[i, j] = rotations_of[k + 1, i, j] = after[i, j]
         x += (normals[k, 3] * share[3] + twists[k, 3]) * dt
         y += (normals[k, 4] * share[4] + twists[k, 4]) * dt
         z += (normals[k, 5] * share[5] + twists[k, 5]) * dt
@@ -54,7 +59,7 @@ def propagate(
     rotation: Any, translation: Any, twist: Any, dt: float, turned: Any, moved: Any
 ) -> None:
     """Return the pose after dt seconds of a twist."""
-    turn = np.empty((3, 3))
+    turn = workspace((3, 3))
     rotations.exp(twist[0] * dt, twist[1] * dt, twist[2] * dt, turn)
     rotations.compose(turn, rotation, turned)
     for i in range(3):
