@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("plotly", reason="needs the extra viz")
 
 from rbl_gym import bounds, estimators, placement
-from rbl_gym.app import place_answer, place_figures, place_html, place_report
+from rbl_gym.app import place_answer, place_figures, place_html, place_report, place_summary
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import bodies, obstacles
 from rbl_gym.placement import criteria, layouts, scene_files
@@ -211,7 +211,7 @@ COMMAND = ["place", "--scene", "uwb_room", "--anchors", "4", "--trials", "20", "
 def test_the_command_writes_a_table_a_picture_a_page_and_figures(tmp_path, capsys):
     files = {end: tmp_path / "new" / f"x.{end}" for end in ("png", "html", "json")}
     options = ["--plot", str(files["png"]), "--html", str(files["html"]), "--json",
-               str(files["json"])]  # fmt: skip
+               str(files["json"]), "--details"]  # fmt: skip
     settings = dict(matplotlib.rcParams)
     assert main([*COMMAND, *options]) == 0
     assert dict(matplotlib.rcParams) == settings
@@ -273,7 +273,23 @@ def test_the_picture_is_the_same_for_the_same_result(placed, tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_coplanar_anchors_are_warned_of_at_the_top(capsys):
+def test_the_short_answer_has_the_verdict_first_and_the_notes_last(placed, capsys):
+    place_summary.print_place(placed.result)
+    short = capsys.readouterr().out
+    place_summary.print_place(placed.result, details=True)
+    long = capsys.readouterr().out
+    assert len(short.splitlines()) < 0.5 * len(long.splitlines())
+    parts = ["anchors", "the usual layouts", "checked by Monte Carlo", "One more anchor", "Note:"]
+    for shown in (short, long):
+        assert " ".join(shown.split()).startswith(place_report.verdict(placed.result))
+    found = [short.find(part) for part in parts if part in short]
+    assert found == sorted(found)
+    assert "--details" in short
+    assert "state requirements: use [[zones]]" in short
+    assert "predicted over the region" not in short
+
+
+def test_coplanar_anchors_are_warned_of(capsys):
     problem = scene_files.problem("auv_buoys", 3)
     result = place_anchors(problem, Question(range(3, 4), trials=20)).result
     assert result["coplanar"]
@@ -281,9 +297,10 @@ def test_coplanar_anchors_are_warned_of_at_the_top(capsys):
     (warning,) = place_answer.warnings(result)
     assert "mirror image" in warning
     assert "add a fourth" in warning
-    place_report.print_place(result)
-    top, _, _ = capsys.readouterr().out.partition("margin")
-    assert "Note: All anchors lie in one plane." in top
+    place_summary.print_place(result)
+    shown = capsys.readouterr().out
+    assert "One note is at the end." in " ".join(shown.split("┏")[0].split())
+    assert any(line.startswith("Note: All anchors lie in one") for line in shown.splitlines())
 
 
 def test_an_exchange_that_removes_the_mirror_image_is_suggested():

@@ -151,6 +151,18 @@ def test_the_interval_is_wilsons(within, places):
     np.testing.assert_allclose(asked.wilson_interval(within, places), tuple(want), atol=1e-12)
 
 
+def test_the_interval_of_sets_is_students():
+    rng = np.random.default_rng(3)
+    drawn = rng.normal(0.9, 0.01, (4000, 8))
+    low, high = asked.set_interval(drawn[0])
+    known = stats.t.interval(0.95, 7, drawn[0].mean(), stats.sem(drawn[0]))
+    assert (low, high) == pytest.approx(known)
+    found = np.array([asked.set_interval(shares) for shares in drawn])
+    held = ((found[:, 0] <= 0.9) & (found[:, 1] >= 0.9)).mean()
+    # Four standard deviations of the share of 4000.
+    assert held == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / 4000))
+
+
 def test_a_place_is_within_where_no_limit_is_exceeded():
     ones = np.ones(3)
     errors = asked.Errors(ones, ones, ones, np.array([0.1, 0.3, 0.1]), ones, np.array([1, 1, 4.0]))

@@ -9,8 +9,8 @@ SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? TOO CLOSE", "no
 # Verdicts as tables show them.
 WORDS = {name: name for name in SIGNS} | {"undecided": "too close"}
 HOW_TO_ASK = (
-    "To set one, use [[zones]] in the file, in place of [region], each with low, high, position_m "
-    "or heading_deg, and share."
+    "For a verdict, state requirements: use [[zones]] in the file, in place of [region], each with "
+    "low, high, position_m or heading_deg, and share."
 )
 _NAMES = {
     "position_m": ("horizontal position", "m"),

@@ -102,6 +102,9 @@ def add_place(commands: Any) -> None:
         help="work region, metres; also its corners x0,y0,z0,x1,y1,z1 (write --region=-1,... if "
         "the first number is negative)",
     )
+    place.add_argument(
+        "--details", action="store_true", help="print all tables, and what their columns mean"
+    )
     add_trials(place, 500, "number of trials of the check with filters")
     add_plot(place, "with maps over the plan, and layouts")
     add_html(place, "page with the plan, its maps, the tables and the scene in 3-D")
@@ -154,9 +157,9 @@ def _place(options: argparse.Namespace) -> int:
         place_html.write_place(placed, options.html)
     write_report(placed, options)
     if write_json(placed.result, options.json):
-        from rbl_gym.app import place_report
+        from rbl_gym.app import place_summary
 
-        place_report.print_place(placed.result)
+        place_summary.print_place(placed.result, options.details)
         layout = ", ".join(options.export)
         print_files(picture=options.plot, page=options.html, report=options.report, layout=layout)
     return 0

@@ -1,4 +1,4 @@
-"""Tables of a placement, on the terminal and in HTML."""
+"""All tables of a placement, for the terminal, the page and the report."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
-from rbl_gym.app.place_answer import HOW_TO_ASK, WORDS, warnings
+from rbl_gym.app.place_answer import WORDS, typical
 from rbl_gym.app.place_survey import survey_table
-from rbl_gym.app.tables import new_console, new_table
 
 # Fractions of lost bodies above this are mentioned.
 _MANY_LOST = 0.01
@@ -27,8 +26,8 @@ def tables(result: dict[str, Any]) -> Iterator[Rows]:
     """Return all tables of a result, starting with the requirements."""
     yield _zones(result)
     if "fewest" in result:
-        yield from _fewest(result["fewest"])
-    yield _anchors(result)
+        yield from fewest_rows(result["fewest"])
+    yield anchor_rows(result)
     yield _without(result)
     if result["next_anchor"] is not None:
         yield _next(result)
@@ -37,7 +36,7 @@ def tables(result: dict[str, Any]) -> Iterator[Rows]:
     yield _worst(result)
     yield _prediction(result)
     yield Rows(*survey_table(result))
-    yield _layouts(result["layouts"])
+    yield layout_rows(result["layouts"])
     yield _check(result["check"])
     if any("within" in row for row in _check_zones(result["check"])):
         yield _check_within(result["check"])
@@ -50,7 +49,7 @@ def verdict(result: dict[str, Any]) -> str:
     survives = ", with any one anchor missing" if result["survive"] else ""
     count = f"{result['n_anchors']} anchors{survives}"
     if result["verdict"] == "no requirement":
-        return f"{count}: no zone has a requirement. {HOW_TO_ASK}"
+        return f"{count}: {typical(result['zones'])}. No zone has a requirement."
     words = {"pass": "PASS", "fail": "FAIL", "undecided": "TOO CLOSE TO TELL"}
     zones = [row for row in result["zones"] if row["verdict"] != "no requirement"]
     passed = sum(row["verdict"] == "pass" for row in zones)
@@ -67,7 +66,8 @@ def verdict(result: dict[str, Any]) -> str:
     count = less["n_anchors"]
     if fewest["proved"]:
         return f"{text} The least number: no choice of {count} passes."
-    return f"{text} No layout of {count} that passes was found; another --seed may find one."
+    searches = f"{fewest['searches']} search{'es' if fewest['searches'] > 1 else ''}"
+    return f"{text} The least number found: {searches} found no layout of {count} that passes."
 
 
 def notes(result: dict[str, Any]) -> list[str]:
@@ -109,21 +109,6 @@ def notes(result: dict[str, Any]) -> list[str]:
     return found
 
 
-def print_place(result: dict[str, Any]) -> None:
-    """Print the answer with its warnings, every table, and the notes."""
-    console = new_console()
-    console.print(verdict(result))
-    for warning in warnings(result):
-        console.print(f"Note: {warning}")
-    for rows in tables(result):
-        table = new_table(rows.title, rows.headings[:1], rows.headings[1:], whole=1)
-        for row in rows.rows:
-            table.add_row(*row)
-        console.print(table)
-    for note in notes(result):
-        console.print(note)
-
-
 def _zones(result: dict[str, Any]) -> Rows:
     rows = []
     for row in result["zones"]:
@@ -140,11 +125,12 @@ def _zones(result: dict[str, Any]) -> Rows:
         "position median (m)", "p95", "heading median (deg)", "p95",
     ]  # fmt: skip
     if any(row[-1] is not None for row in rows):
-        return Rows(_title(result), [*headings, "worst without"], [_texts(row) for row in rows])
-    return Rows(_title(result), headings, [_texts(row[:-1]) for row in rows])
+        return Rows(title(result), [*headings, "worst without"], [_texts(row) for row in rows])
+    return Rows(title(result), headings, [_texts(row[:-1]) for row in rows])
 
 
-def _title(result: dict[str, Any]) -> str:
+def title(result: dict[str, Any]) -> str:
+    """Return the name, the number of anchors, and the search that found them."""
     return f"{result['scene']}: {result['n_anchors']} anchors ({result['method']})"
 
 
@@ -180,8 +166,8 @@ def required(asked: dict[str, Any]) -> str:
     return f"{', '.join(parts)} in {100 * asked['share']:g} %"
 
 
-def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
-    """Return which requirements would fail with one anchor less."""
+def fewest_rows(fewest: dict[str, Any]) -> Iterator[Rows]:
+    """Yield the table of the requirements that fail with one anchor less."""
     less = fewest["one_less"]
     if less is None:
         return
@@ -190,9 +176,9 @@ def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
         if "share" not in row:
             continue
         needs = row["would_pass"]
-        limits = [_figure(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
+        values = [_figure(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
         factor = f"{needs['factor']:.3f}"
-        rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *limits, factor])
+        rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *values, factor])
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
         "would pass: position (m)", "height (m)", "heading (deg)", "all times",
@@ -200,7 +186,8 @@ def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
     yield Rows(f"with one anchor fewer, {less['n_anchors']}", headings, rows)
 
 
-def _anchors(result: dict[str, Any]) -> Rows:
+def anchor_rows(result: dict[str, Any]) -> Rows:
+    """Return the positions of the anchors."""
     rows = [
         [
             anchor["name"],
@@ -318,12 +305,24 @@ _FIGURES = (
 )
 
 
-def _layouts(layouts: dict[str, dict[str, float]]) -> Rows:
-    rows = [
-        [name, *(digits(row[key], n) for _, key, n in _FIGURES), f"{row['ratio']:.3f}"]
-        for name, row in layouts.items()
-    ]
-    headings = ["layout", *(heading for heading, _, _ in _FIGURES), "b / designed"]
+def layout_rows(layouts: dict[str, dict[str, Any]], short: bool = False) -> Rows:
+    """Return the designed or given layout beside the usual ones.
+
+    With requirements: the verdict, and the margin of the worst zone. `short`: without the errors.
+    """
+    figures = _FIGURES[:1] if short else _FIGURES
+    own = "given" if "given" in layouts else "designed"
+    asks = any("margin" in zone for zone in layouts[own]["zones"])
+    rows = []
+    for name, row in layouts.items():
+        cells = [name]
+        if asks:
+            margin = min(zone["margin"] for zone in row["zones"] if "margin" in zone)
+            cells += [WORDS[row["verdict"]], f"{margin:.3f}"]
+        cells += [digits(row[key], n) for _, key, n in figures]
+        rows.append([*cells, f"{row['ratio']:.3f}"])
+    headings = ["layout", *(["verdict", "margin"] if asks else [])]
+    headings += [*(heading for heading, _, _ in figures), f"b / {own}"]
     return Rows("the usual layouts, predicted", headings, rows)
 
 

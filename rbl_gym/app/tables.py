@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -67,8 +68,17 @@ class _PlainConsole:
     """`print` as rich's, without style."""
 
     def print(self, *shown: Any, **_style: Any) -> None:
-        """Print text or tables."""
+        """Print text or tables; text is wrapped at words on a terminal."""
+        if sys.stdout.isatty():
+            width = shutil.get_terminal_size().columns
+            shown = tuple(_wrapped(x, width) if isinstance(x, str) else x for x in shown)
         print(*shown)
+
+
+def _wrapped(text: str, width: int) -> str:
+    """Return text with its lines broken at spaces."""
+    lines = (textwrap.wrap(line, width, break_on_hyphens=False) for line in text.splitlines())
+    return "\n".join("\n".join(line) for line in lines)
 
 
 class Table:

@@ -25,7 +25,7 @@ def add_best(state: State, seed: int = 0) -> State:
     found = choosing.next_anchor(state.problem, state.anchors, seed)
     if found is None:
         raise ValueError("no mount is free for another anchor")
-    return with_one_more(state, found[0])
+    return with_one_more(state, found)
 
 
 def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:

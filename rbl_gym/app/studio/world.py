@@ -15,7 +15,7 @@ from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.sample import Sample, sample
 from rbl_gym.placement.setting import Setting
-from rbl_gym.studies.placing.accuracy import draw_places
+from rbl_gym.studies.placing.accuracy import spread_places
 
 # Number of poses for comparing layouts, and of positions of each zone for its verdict.
 N_POSES, N_PLACES = 1024, 600
@@ -96,7 +96,7 @@ class World:
     def places(self) -> tuple[FloatArray, ...]:
         """Positions (L, 3) of every zone for its verdict, as in `rbl-gym place` with seed 0."""
         return tuple(
-            draw_places(self.base, zone, np.random.default_rng([0, 3]), N_PLACES)
+            spread_places(self.base, zone, np.random.default_rng([0, 3]), N_PLACES)
             for zone in self.base.zones
         )
 

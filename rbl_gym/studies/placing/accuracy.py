@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -66,12 +68,33 @@ def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: i
 
     ValueError if almost no position is free.
     """
+    return _free_of(problem, zone, count, lambda size: rng.random((size, 3)))
+
+
+def spread_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: int) -> FloatArray:
+    """Draw positions as `draw_places`, which fill the zone more evenly.
+
+    They are a Sobol sequence with a random shift. Each position is uniform, but averages and shares
+    over all positions vary less than with independent positions.
+    """
+    from scipy.stats import qmc  # slow to import
+
+    sequence, shift = qmc.Sobol(3, scramble=False), rng.random(3)
+    return _free_of(problem, zone, count, lambda size: (sequence.random(size) + shift) % 1.0)
+
+
+def _free_of(
+    problem: Problem, zone: Zone, count: int, draw: Callable[[int], FloatArray]
+) -> FloatArray:
+    """Return the first free positions (count, 3) of those that `draw` returns in the unit cube."""
     low, high = zone.bounds()
     free = np.empty((0, 3))
+    # A Sobol sequence is even over powers of two.
+    size = max(_DRAWN, 2 ** math.ceil(math.log2(2 * count)))
     for _ in range(_DRAWS):
         if len(free) >= count:
             return free[:count]
-        drawn = low + rng.random((max(_DRAWN, 2 * count), 3)) * (high - low)
+        drawn = low + draw(size) * (high - low)
         free = np.concatenate([free, drawn[is_free(problem, zone, drawn)]])
     raise ValueError(f"zone {zone.name!r} has almost no free place: obstacles cover it")
 

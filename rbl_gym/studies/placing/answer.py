@@ -14,6 +14,7 @@ from rbl_gym.placement import criteria, scene_files
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing import check, choosing, design
 from rbl_gym.studies.placing.accuracy import accuracy_without_each
+from rbl_gym.studies.placing.changes import is_flat, out_of_plane, with_next
 from rbl_gym.studies.placing.choosing import Fewest
 from rbl_gym.studies.placing.contributions import without_each
 from rbl_gym.studies.placing.design import Design
@@ -22,13 +23,13 @@ from rbl_gym.studies.placing.judging import (
     Judged,
     at_edges,
     judge,
+    judge_beside,
     limits_of,
-    overall_score,
     overview,
     short_row,
+    verdict,
     zone_row,
 )
-from rbl_gym.studies.placing.out_of_plane import exchange_out_of_plane
 from rbl_gym.studies.placing.surveys import survey_rows
 from rbl_gym.studies.progress import Advance, silent
 
@@ -215,25 +216,16 @@ def _result(
         "method": found.method,
         "anchors": rows,
         "cost": float(problem.mounts.cost(anchors).sum()),
-        "coplanar": _is_flat(anchors),
-        "out_of_plane": _out_of_plane(problem, anchors, names, judged, seed, survive),
-        "next_anchor": _next(problem, anchors, judged, seed, survive),
+        "coplanar": is_flat(anchors),
+        "out_of_plane": out_of_plane(problem, anchors, names, judged, seed, survive),
+        "next_anchor": with_next(problem, anchors, judged, seed, survive),
         "predicted": overview(judged, edges),
         "survey": survey_rows(problem, anchors, judged),
         "criteria": _criteria(problem, anchors),
-        "layouts": _comparison(problem, found, seed, survive),
+        "layouts": _comparison(problem, found, judged, seed, survive),
         "check": check.check_layout(problem, anchors, question.trials, seed),
     }
     return result
-
-
-def verdict(judged: list[Judged]) -> str:
-    """Return the worst verdict of the zones; zones without a requirement do not count."""
-    found = {one.verdict for one in judged}
-    for name in ("fail", "undecided", "pass"):
-        if name in found:
-            return name
-    return "no requirement"
 
 
 def _obstacles(problem: Problem) -> list[dict[str, Any]]:
@@ -254,9 +246,12 @@ def _anchors(
     problem: Problem, question: Question, anchors: FloatArray, judged: list[Judged]
 ) -> list[dict[str, Any]]:
     """Return a row for each anchor: its position, the share it sees, the accuracy without it."""
-    first = [one.first()._replace(without=None) for one in judged]
-    lost = [accuracy_without_each(problem, anchors, one.places, one.zone) for one in first]
-    seen = np.concatenate([problem.share(anchors, one.places) >= _SEEN for one in first])
+    lost = [
+        one.without or accuracy_without_each(problem, anchors, one.places, one.zone)
+        for one in judged
+    ]
+    # Equally many positions of each zone.
+    seen = np.concatenate([problem.share(anchors, one.places[:PLACES]) >= _SEEN for one in judged])
     known = {
         tuple(place): name
         for place, name in zip(
@@ -272,7 +267,7 @@ def _anchors(
             anchors.tolist(),
             problem.mounts.names(anchors),
             problem.mounts.cost(anchors).tolist(),
-            without_each(first, lost),
+            without_each([one._replace(without=None) for one in judged], lost),
             strict=True,
         )
     ):
@@ -290,53 +285,6 @@ def _anchors(
     return rows
 
 
-def _next(
-    problem: Problem, anchors: FloatArray, judged: list[Judged], seed: int, survive: int
-) -> dict[str, Any] | None:
-    """Return the best position of one more anchor, and the accuracy with it."""
-    found = choosing.next_anchor(problem, anchors, seed, survive)
-    return None if found is None else _with_anchor(problem, *found, judged)
-
-
-def _out_of_plane(
-    problem: Problem,
-    anchors: FloatArray,
-    names: list[str],
-    judged: list[Judged],
-    seed: int,
-    survive: int,
-) -> dict[str, Any] | None:
-    """Return the best exchange of one anchor after which the anchors are not coplanar."""
-    found = exchange_out_of_plane(problem, anchors, seed, survive) if _is_flat(anchors) else None
-    if found is None:
-        return None
-    index, place = found
-    moved = np.where(np.arange(len(anchors))[:, None] == index, place, anchors)
-    after = judge(problem, moved, seed, survive, PLACES)
-    return {"anchor": names[index], **_with_anchor(problem, place, after, judged)}
-
-
-def _with_anchor(
-    problem: Problem, place: FloatArray, after: list[Judged], judged: list[Judged]
-) -> dict[str, Any]:
-    """Return a new position of an anchor, and the accuracy with it and without it."""
-    now = [one.first() for one in judged]
-    return {
-        **dict(zip(("x_m", "y_m", "z_m"), place.tolist(), strict=True)),
-        "mount": problem.mounts.names(place[None])[0],
-        "cost": float(problem.mounts.cost(place[None])[0]),
-        "verdict": verdict(after),
-        "score_m": _overall(after),
-        "ratio": _overall(after) / _overall(now),
-        "zones": [short_row(one) for one in after],
-        "zones_now": [short_row(one) for one in now],
-    }
-
-
-def _overall(judged: list[Judged]) -> float:
-    return float(overall_score([one.zone for one in judged], [one.judged.score for one in judged]))
-
-
 def _fewest_row(least: Fewest) -> dict[str, Any]:
     """Return the row of the smallest number: met or not, the margin, the result with one less."""
     row: dict[str, Any] = {
@@ -344,6 +292,7 @@ def _fewest_row(least: Fewest) -> dict[str, Any]:
         "n_anchors": len(least.anchors),
         "margin": min(short_row(one)["margin"] for one in least.judged if one.asks),
         "proved": least.proved and least.met,
+        "searches": least.searches,
         "one_less": None,
     }
     if least.one_less is not None:
@@ -368,14 +317,13 @@ def _summary(problem: Problem, anchors: FloatArray, judged: list[Judged]) -> dic
 
 
 def _comparison(
-    problem: Problem, found: Design, seed: int, survive: int
+    problem: Problem, found: Design, judged: list[Judged], seed: int, survive: int
 ) -> dict[str, dict[str, Any]]:
     """Return the figures of the design and of the usual layouts, one row each."""
-    rows = {"given" if found.method == "given" else "designed": found.anchors}
-    rows |= design.usual_layouts(problem, seed)
-    table = {
-        name: _summary(problem, anchors, judge(problem, anchors, seed, survive, PLACES))
-        for name, anchors in rows.items()
+    own = "given" if found.method == "given" else "designed"
+    table = {own: _summary(problem, found.anchors, judged)} | {
+        name: _summary(problem, anchors, judge_beside(problem, anchors, judged, survive))
+        for name, anchors in design.usual_layouts(problem, seed).items()
     }
     least = next(iter(table.values()))["score_m"]
     return {
@@ -389,12 +337,6 @@ def _criteria(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
     many = dataclasses.replace(problem, n_anchors=len(anchors), n_poses=_MANY_POSES)
     values = criteria.criteria(many, problem.context, anchors)._asdict()
     numbers = {name: float(value) for name, value in values.items()}
-    if _is_flat(anchors):
+    if is_flat(anchors):
         numbers["conditioning"] = math.inf
     return {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-
-
-def _is_flat(anchors: FloatArray) -> bool:
-    """Return whether the anchors lie in one plane, as three always do."""
-    spread = np.linalg.svd(anchors - anchors.mean(axis=0), compute_uv=False)
-    return bool(len(anchors) < 4 or spread[2] < 1e-6 * spread[0])

@@ -10,10 +10,10 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.sample import prior_of
-from rbl_gym.studies.placing.accuracy import draw_places
+from rbl_gym.studies.placing.accuracy import spread_places
 from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
 from rbl_gym.studies.placing.links import anchor_information
-from rbl_gym.studies.placing.requirements import Limits, turns
+from rbl_gym.studies.placing.requirements import Limits, turns, value_at_share
 from rbl_gym.studies.placing.stock_search import (
     Stock,
     ZonePoses,
@@ -34,8 +34,13 @@ _PLACES, _LEAST_PLACES, _TURNS = 400, 128, 3
 _CANDIDATES, _NEAR = 200, 0.6
 # Distance of near candidates in the later rounds, as shares of the extent of the mounts.
 _REACHES = (0.05, 0.015)
-# A layout with a value above this is not refined in later rounds.
-_NEAR_ENOUGH = 1.06
+# Searches for a layout of one number of anchors: from different starts, then finer ones from the
+# best layouts. A finer search has this many positions and candidates.
+_COARSE, _FINE = 6, 4
+_FINE_PLACES, _FINE_CANDIDATES = 1600, 100
+# The finer searches end if the error at the required share is this many times the limit: at the
+# first two, and at the others.
+_HOPELESS = 1.2, 1.08
 # All choices are tried if there are at most this many.
 _MOST_CHOICES = 3000
 
@@ -56,6 +61,8 @@ class Fewest(NamedTuple):
     proved
         Whether all choices with one anchor less were tried, which is done for a short list of
         mounts.
+    searches
+        Number of searches for a layout with one anchor less.
     """
 
     anchors: FloatArray
@@ -64,6 +71,7 @@ class Fewest(NamedTuple):
     one_less: FloatArray | None
     judged_less: list[Judged]
     proved: bool
+    searches: int
 
 
 # --- candidates ----------------------------------------------------------------------------------
@@ -96,7 +104,7 @@ def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int | No
     zones, parts = [], []
     for zone in problem.zones:
         count = (n_places or _PLACES) // len(problem.zones)
-        places = draw_places(problem, zone, rng, max(_LEAST_PLACES, count))
+        places = spread_places(problem, zone, rng, max(_LEAST_PLACES, count))
         rotation = turns(zone.attitude, _TURNS)
         zones.append(
             ZonePoses(
@@ -117,35 +125,41 @@ def is_met(judged: list[Judged]) -> bool:
 
 
 def improved(
-    problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
+    problem: Problem, anchors: FloatArray, seed: int, survive: int = 0, fine: bool = False
 ) -> tuple[FloatArray, float]:
     """Improve a layout (M, 3) by exchanges; return it and its value (`stock_search.value`).
 
     One anchor at a time is exchanged for candidates everywhere, then near and far. The fixed
     anchors of the problem, the first ones, are kept. With `survive` 1 the worst case over the loss
-    of any one anchor counts.
+    of any one anchor counts. A `fine` search uses more positions, on which its value depends less,
+    and fewer candidates.
     """
     rng = np.random.default_rng([seed, len(anchors), 5])
     reached = math.inf
     listed = problem.mounts.listed() is not None
+    count, n_places = (_FINE_CANDIDATES, _FINE_PLACES) if fine else (_CANDIDATES, None)
     for reach in (None,) if listed else (None, *_REACHES):
-        points = first_then_others(anchors, _around(problem, rng, anchors, reach))
-        stock = stock_of(problem, points, seed)
+        points = first_then_others(anchors, _around(problem, rng, anchors, reach, count))
+        stock = stock_of(problem, points, seed, n_places)
         chosen, reached = swapped(stock, range(len(anchors)), len(problem.fixed), survive)
         anchors = points[chosen]
     return anchors, reached
 
 
 def _around(
-    problem: Problem, rng: np.random.Generator, anchors: FloatArray, reach: float | None
+    problem: Problem,
+    rng: np.random.Generator,
+    anchors: FloatArray,
+    reach: float | None,
+    count: int,
 ) -> FloatArray:
     """Return candidates everywhere, or mostly within a distance of the anchors."""
     if reach is None:
-        return candidates(problem, rng)
+        return candidates(problem, rng, count)
     extent = float(np.ptp(problem.mounts.bounds(), axis=0).max())
-    near = np.repeat(anchors, max(1, round(_NEAR * _CANDIDATES / len(anchors))), axis=0)
+    near = np.repeat(anchors, max(1, round(_NEAR * count / len(anchors))), axis=0)
     near = near + reach * extent * rng.standard_normal(near.shape)
-    far = candidates(problem, rng, round((1 - _NEAR) * _CANDIDATES))
+    far = candidates(problem, rng, round((1 - _NEAR) * count))
     return np.concatenate([_legal(problem, near), far])
 
 
@@ -164,8 +178,10 @@ def fewest_anchors(
     """Find the smallest number of anchors that meets the requirements of all zones.
 
     Anchors are added greedily up to a sufficient number. Then the number is reduced by one at a
-    time, from several starts with exchanges, until it does not suffice. For a short list of mounts,
-    all choices of one less are tried.
+    time until no search finds a sufficient layout. The searches for a number have different starts,
+    one of them the layout with one anchor more, without its least important anchor. The last
+    searches refine the best layout found, over more positions. For a short list of mounts, all
+    choices are tried.
 
     Parameters
     ----------
@@ -178,7 +194,7 @@ def fewest_anchors(
     survive
         1: the requirements must be met without any one of the anchors.
     advance
-        Called after every tested number.
+        Called after every search.
 
     Raises
     ------
@@ -196,45 +212,83 @@ def fewest_anchors(
     stock = stock_of(problem, points, seed)
     plain = stock._replace(zones=tuple(z._replace(limits=Limits()) for z in stock.zones))
     path = _growth(stock, keep, numbers[-1], survive)
-    starts = path, _growth(plain, keep, max(path), survive)
+    paths = path, _growth(plain, keep, max(path), survive)
 
-    def attempt(count: int, more: list[FloatArray]) -> tuple[FloatArray, list[Judged], bool]:
-        """Return the best layout of a number of anchors, from all starts, and its results."""
-        some = rng.permutation(np.arange(keep, len(points)))[: count - keep].tolist()
-        paths = [path[count] for path in starts if count in path]
-        tried = [swapped(stock, path, keep, survive) for path in [*paths, [*range(keep), *some]]]
+    def starts_of(count: int) -> list[FloatArray]:
+        """Return layouts of a number of anchors, the best first."""
+        chosen = [path[count] for path in paths if count in path]
+        for _ in range(_COARSE - len(chosen)):
+            some = rng.permutation(np.arange(keep, len(points)))[: count - keep]
+            chosen.append([*range(keep), *some.tolist()])
+        found = [swapped(stock, one, keep, survive) for one in chosen]
         if 0 < math.comb(len(points) - keep, count - keep) <= _MOST_CHOICES:
-            tried.append(all_choices(stock, count, keep, survive))
-        layouts = [(reached, points[chosen]) for chosen, reached in tried]
-        layouts += [(_value(problem, one, seed, survive), one) for one in more]
-        least, best = min(layouts, key=lambda pair: pair[0])
-        judged = judge(problem, best, seed, survive)
-        if not is_met(judged) and least < _NEAR_ENOUGH:
-            other, reached = improved(problem, best, seed, survive)
-            if reached < least:
-                best, judged = other, judge(problem, other, seed, survive)
-        advance()
-        return best, judged, is_met(judged)
+            found.append(all_choices(stock, count, keep, survive))
+        return [points[one] for one, _ in sorted(found, key=lambda pair: pair[1])]
 
-    count = _first_count(stock, starts, numbers, survive)
-    advance(0, more=1)
-    best, judged, met = attempt(count, [])
-    while not met and count < min(numbers[-1], len(points)):
+    def attempt(count: int, more: list[FloatArray]) -> _Found:
+        return _searched(problem, [*more, *starts_of(count)], seed, survive, advance)
+
+    count = _first_count(stock, paths, numbers, survive)
+    best = attempt(count, [])
+    while not best.met and count < min(numbers[-1], len(points)):
         count += 1
-        advance(0, more=1)
-        best, judged, met = attempt(count, [])
-    less, judged_less = None, []
-    while met and count > max(numbers[0], keep, 1):
-        advance(0, more=1)
-        less, judged_less, still = attempt(count - 1, _one_dropped(problem, best, seed, survive))
-        if not still:
+        best = attempt(count, [])
+    less = None
+    while best.met and count > max(numbers[0], keep, 1):
+        less = attempt(count - 1, _one_dropped(problem, best.anchors, seed, survive))
+        if not less.met:
             break
-        count, best, judged, less, judged_less = count - 1, less, judged_less, None, []
+        count, best, less = count - 1, less, None
     choices = math.comb(len(points) - keep, count - 1 - keep) if count - 1 >= keep else 0
     proved = problem.mounts.listed() is not None and choices <= _MOST_CHOICES
-    if met:
-        best, judged = _cheapened(problem, best, judged, seed, survive)
-    return Fewest(best, judged, met, less, judged_less, proved)
+    anchors, judged = best.anchors, best.judged
+    if best.met:
+        anchors, judged = _cheapened(problem, anchors, judged, seed, survive)
+    if less is None:
+        return Fewest(anchors, judged, best.met, None, [], proved, 0)
+    return Fewest(anchors, judged, best.met, less.anchors, less.judged, proved, less.searches)
+
+
+class _Found(NamedTuple):
+    """Best layout of some searches, its results, and the number of searches."""
+
+    anchors: FloatArray
+    judged: list[Judged]
+    met: bool
+    searches: int
+
+
+def _searched(
+    problem: Problem, starts: list[FloatArray], seed: int, survive: int, advance: Advance
+) -> _Found:
+    """Search from the first starts, then refine the best layout, until the requirements are met.
+
+    Layouts are compared by the errors at the required shares, at the same positions.
+    """
+    found: list[tuple[float, FloatArray, list[Judged]]] = []
+
+    def search(start: FloatArray, fine: bool) -> bool:
+        advance(0, more=1)
+        # Other seeds than those near that of the user.
+        anchors, _ = improved(problem, start, seed + 1000 * len(found), survive, fine)
+        judged = judge(problem, anchors, seed, survive)
+        asked = [one for one in judged if one.asks]
+        reached = [value_at_share(one.relative[:PLACES], one.zone.share) for one in asked]
+        found.append((float(max(reached)), anchors, judged))
+        advance()
+        return is_met(judged)
+
+    met = any(search(start, False) for start in starts[:_COARSE])
+    for k in range(_FINE):
+        if met:
+            break
+        found.sort(key=lambda row: row[0])
+        if found[0][0] > _HOPELESS[k > 1]:
+            break
+        # First the two best layouts, then the best one.
+        met = search(found[min(k, len(found) - 1) if k < 2 else 0][1], True)
+    _, anchors, judged = found[-1] if met else min(found, key=lambda row: row[0])
+    return _Found(anchors, judged, met, len(found))
 
 
 def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[int]]:
@@ -257,10 +311,6 @@ def _first_count(
         if count >= max(numbers[0], 1) and value(stock, path[count], survive) <= 1:
             return count
     return max(min(numbers[-1], max(path)), numbers[0])
-
-
-def _value(problem: Problem, anchors: FloatArray, seed: int, survive: int) -> float:
-    return value(stock_of(problem, anchors, seed), range(len(anchors)), survive)
 
 
 def _one_dropped(
@@ -290,10 +340,8 @@ def _cheapened(
 
 def next_anchor(
     problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
-) -> tuple[FloatArray, list[Judged]] | None:
-    """Return the best position (3,) of one more anchor, and the zones with it.
-
-    The result is None if no mount is left.
+) -> FloatArray | None:
+    """Return the best position (3,) of one more anchor; None if no mount is left.
 
     Parameters
     ----------
@@ -308,5 +356,4 @@ def next_anchor(
         return None
     stock = stock_of(problem, points, seed, _LEAST_PLACES)
     chosen, _ = next(grown(stock, range(len(anchors)), len(anchors) + 1, survive))
-    added = points[chosen]
-    return added[-1], judge(problem, added, seed, survive, PLACES)
+    return points[chosen[-1]]

@@ -10,11 +10,17 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.monte_carlo import rms
-from rbl_gym.studies.placing.accuracy import accuracy, accuracy_without_each, draw_places, free_grid
+from rbl_gym.studies.placing.accuracy import (
+    accuracy,
+    accuracy_without_each,
+    free_grid,
+    spread_places,
+)
 from rbl_gym.studies.placing.requirements import (
     Errors,
     Limits,
     relative_errors,
+    set_interval,
     share_within,
     value_at_share,
     wilson_interval,
@@ -24,15 +30,19 @@ __all__ = [
     "Judged",
     "at_edges",
     "judge",
+    "judge_beside",
     "judge_zone",
     "limits_of",
     "overview",
     "short_row",
+    "verdict",
     "zone_row",
 ]
 
-# Number of positions drawn in a zone at first, and the maximum if the verdict is undecided.
+# Number of positions drawn in a zone at first, and the maximum if the verdict is undecided. They
+# are drawn in sets of the first number. The interval is from the sets if there are at least 8.
 PLACES, MOST_PLACES = 600, 9600
+_SETS = 8
 # Limits by the names of a zone's requirement.
 _KEYS = {"horizontal": "position_m", "height": "height_m", "heading": "heading_deg"}
 # Number of worst positions to report, and their minimum distance as a share of the zone's extent.
@@ -87,16 +97,19 @@ class Judged(NamedTuple):
         """Return the errors (L) over their limits, the largest at each position."""
         return relative_errors(self.judged, limits_of(self.zone))
 
-    def first(self) -> Judged:
-        """Return the result at the first positions only, which are common to all layouts."""
-        some = slice(PLACES)
-        without = None if self.without is None else self.without.of_places(some)
-        return Judged(self.zone, self.places[some], self.errors.of_places(some), without)
-
     @property
     def interval(self) -> tuple[float, float]:
-        """Return the 95 % interval (Wilson) of the share within."""
-        return wilson_interval(int((self.relative <= 1).sum()), len(self.places))
+        """Return the 95 % interval of the share within.
+
+        It is `wilson_interval`, or from many sets of positions `set_interval`, which is narrower.
+        """
+        within = self.relative <= 1
+        count = len(within) // PLACES
+        if count >= _SETS and len(within) == count * PLACES:
+            shares = within.reshape(count, PLACES).mean(axis=-1)
+            if np.ptp(shares) > 0:
+                return set_interval(shares)
+        return wilson_interval(int(within.sum()), len(within))
 
     @property
     def verdict(self) -> str:
@@ -140,14 +153,21 @@ def judge_zone(
     rng = np.random.default_rng([seed, 3])
     judged = None
     while True:
-        drawn = 0 if judged is None else len(judged.places)
-        places = draw_places(problem, zone, rng, max(PLACES, drawn))
-        errors = accuracy(problem, anchors, places, zone)
-        without = accuracy_without_each(problem, anchors, places, zone) if survive else None
-        fresh = Judged(zone, places, errors, without)
+        sets = 1 if judged is None else len(judged.places) // PLACES
+        drawn = [spread_places(problem, zone, rng, PLACES) for _ in range(sets)]
+        places = np.concatenate(drawn)
+        fresh = _judged(problem, zone, anchors, places, survive)
         judged = fresh if judged is None else _joined(judged, fresh)
         if judged.verdict != "undecided" or len(judged.places) >= (most or MOST_PLACES):
             return judged
+
+
+def _judged(
+    problem: Problem, zone: Zone, anchors: FloatArray, places: FloatArray, survive: int
+) -> Judged:
+    errors = accuracy(problem, anchors, places, zone)
+    without = accuracy_without_each(problem, anchors, places, zone) if survive else None
+    return Judged(zone, places, errors, without)
 
 
 def _joined(one: Judged, other: Judged) -> Judged:
@@ -325,6 +345,26 @@ def judge(
 ) -> list[Judged]:
     """Return `judge_zone` of every zone. Arguments as there."""
     return [judge_zone(problem, zone, anchors, seed, survive, most) for zone in problem.zones]
+
+
+def verdict(judged: list[Judged]) -> str:
+    """Return the worst verdict of the zones; zones without a requirement do not count."""
+    found = {one.verdict for one in judged}
+    for name in ("fail", "undecided", "pass"):
+        if name in found:
+            return name
+    return "no requirement"
+
+
+def judge_beside(
+    problem: Problem, anchors: FloatArray, judged: list[Judged], survive: int = 0
+) -> list[Judged]:
+    """Evaluate a layout (M, 3) at the positions of the results of another one.
+
+    The difference between the two is then due to the anchors, not to the positions. Arguments as in
+    `judge_zone`; `judged` has the results of the other layout.
+    """
+    return [_judged(problem, one.zone, anchors, one.places, survive) for one in judged]
 
 
 def score_of(problem: Problem, anchors: FloatArray, seed: int) -> float:

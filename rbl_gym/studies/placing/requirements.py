@@ -26,6 +26,7 @@ __all__ = [
     "asked_of",
     "errors_of",
     "relative_errors",
+    "set_interval",
     "turns",
     "value_at_share",
     "wilson_interval",
@@ -224,6 +225,25 @@ def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[floa
     half = z * math.sqrt(share * (1 - share) / places + z * z / (4 * places**2))
     scale = 1 + z * z / places
     return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
+
+
+def set_interval(shares: FloatArray, level: float = 0.95) -> tuple[float, float]:
+    """Return the confidence interval of the share of a zone, from independent sets of positions.
+
+    It is Student's interval of the mean. Unlike `wilson_interval` it takes into account that each
+    set fills the zone evenly.
+
+    Parameters
+    ----------
+    shares
+        Share of the positions within the requirement, of each set (K), K at least 2.
+    level
+        Probability that the interval contains the share.
+    """
+    mean, deviation = float(shares.mean()), float(shares.std(ddof=1))
+    t = float(special.stdtrit(len(shares) - 1, 0.5 + 0.5 * level))
+    half = t * deviation / math.sqrt(len(shares))
+    return max(0.0, mean - half), min(1.0, mean + half)
 
 
 def share_within(relative: FloatArray) -> BoolArray:

@@ -23,9 +23,6 @@ from rbl_gym.studies.what_if import SURVEYS_M, UNCALIBRATED
 
 __all__ = ["survey_rows", "surveyed_accuracy"]
 
-# Number of positions of each zone; a share of 95 % is then accurate to 3 %.
-_PLACES = 200
-
 
 def survey_rows(
     problem: Problem, anchors: FloatArray, judged: list[Judged]
@@ -51,8 +48,7 @@ def survey_rows(
     rows = []
     for name, std, bias in cases:
         found = [
-            surveyed_accuracy(problem, anchors, one.places[:_PLACES], one.zone, std, bias)
-            for one in judged
+            surveyed_accuracy(problem, anchors, one.places, one.zone, std, bias) for one in judged
         ]
         position, rotation, score = (
             float(rms(np.concatenate([errors[k] for errors in found]))) for k in range(3)
