@@ -40,7 +40,7 @@ class Model:
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         assert deterministic
-        self.told.append((state, episode_start.copy()))
+        self.told.append((state, np.array(episode_start)))
         return np.ones((len(observation), 12)), (state or 0) + 1
 
 
@@ -132,7 +132,10 @@ def test_forms_of_policies():
     ("make", "message"),
     [
         (lambda: gym.make("rbl_gym:RBL/SharedAnchors-v0"), "an environment with references.*got"),
-        (lambda: gym.wrappers.RescaleAction(gym.make(ID), 0, 1), "wrappers, got RescaleAction"),
+        (
+            lambda: gym.wrappers.TransformReward(gym.make(ID), lambda reward: reward),
+            "wrappers, got TransformReward",
+        ),
         (lambda: "buoys", "task must be one of 'auv_buoys'"),
         (lambda: 3, "task must be one of auv_buoys,.*got 3"),
     ],
@@ -156,7 +159,7 @@ def test_a_missing_library_is_named_before_a_training_begins(monkeypatch, capsys
 
 @needs("torch", "stable_baselines3")
 def test_a_model_of_stable_baselines3():
-    from stable_baselines3 import PPO
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
     from rbl_gym.studies.learning.sb3_models import policy_of
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
