@@ -140,7 +140,7 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
         (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),
         (["place", "--scene", "uwb_room", "--walls", "A"], "--walls needs a drawing"),
         (["place", "--scene", "uwb_room", "--report", "x.doc"], "--report must end in .pdf"),
-        (["place", "--scene", "uwb_room", "--export", "x.xls"], "--export must end in .csv"),
+        (["place", "--scene", "uwb_room", "--export", "x.xls"], "--export must end in one of .csv"),
         (["place", "--scene", "bad.geojson"], "bad.geojson: not a GeoJSON file"),
     ],
 )
