@@ -118,5 +118,5 @@ def test_without_a_drawing_the_dxf_has_the_building(problem, tmp_path):
 
 def test_another_format_is_refused(problem):
     assert all(Path(f"x{suffix}").suffix == suffix for suffix in SUFFIXES)
-    with pytest.raises(ValueError, match=r"x\.xls: the name of a layout must end in one of \.csv, "):
+    with pytest.raises(ValueError, match=r"x\.xls: the name of a layout must end in one of \.csv"):
         write_layout(problem, ANCHORS, "x.xls")
