@@ -214,6 +214,8 @@ def tell(step):
     told[step] = {name: getattr(m, "__file__", None) for name, m in sys.modules.items()}
 import rbl_gym
 tell("import")
+import rbl_gym.worlds.scenes
+tell("scenes")
 import gymnasium
 env = gymnasium.make("rbl_gym:RBL/Tracking-v0", render_mode="rgb_array")
 env.reset(seed=0)
@@ -235,6 +237,7 @@ print(json.dumps(told))
 def test_import_is_light(fresh):
     heavy = {"matplotlib", "filterpy", "scipy.stats", "rich", "pandas", "torch", "numba"}
     assert not heavy & set(fresh["import"])
+    assert "numba" not in fresh["scenes"]
 
 
 def test_environment_runs_without_the_estimators(fresh):
