@@ -155,11 +155,7 @@ class OffsetEpoch(NamedTuple):
 
 
 def check_offset_epoch(
-    ranges: ArrayLike,
-    anchors: ArrayLike,
-    links: ArrayLike | None,
-    tags: FloatArray,
-    offset: str,
+    ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None, tags: FloatArray, offset: str
 ) -> OffsetEpoch:
     """Check an epoch of ranges with an unknown common offset of a kind, as `check_epoch`.
 
@@ -191,10 +187,7 @@ def links_of_plain_epoch(
 
 @functools.lru_cache(256)
 def _links_of_shapes(
-    ranges: tuple[int, ...],
-    anchors: tuple[int, ...],
-    tags: tuple[int, ...],
-    batch: tuple[int, ...],
+    ranges: tuple[int, ...], anchors: tuple[int, ...], tags: tuple[int, ...], batch: tuple[int, ...]
 ) -> FloatArray | None:
     if not (
         len(anchors) > 1

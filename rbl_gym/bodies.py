@@ -11,13 +11,4 @@ from rbl_gym.geometry.bodies import (
     pyramid,
 )
 
-__all__ = [
-    "centred",
-    "cube",
-    "doa2019",
-    "icassp2013",
-    "octahedron",
-    "perturb",
-    "plate",
-    "pyramid",
-]
+__all__ = ["centred", "cube", "doa2019", "icassp2013", "octahedron", "perturb", "plate", "pyramid"]

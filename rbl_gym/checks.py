@@ -33,9 +33,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def checked(
-    **shapes: tuple[int | str, ...],
-) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def checked(**shapes: tuple[int | str, ...]) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator that applies `check_array` to the named arguments.
 
     An argument whose default is None may be None.

@@ -99,10 +99,7 @@ def test_a_building_in_feet_has_the_same_layout():
     )
     zones = tuple(
         dataclasses.replace(
-            zone,
-            polygon=FEET * zone.polygon,
-            low_m=FEET * zone.low_m,
-            high_m=FEET * zone.high_m,
+            zone, polygon=FEET * zone.polygon, low_m=FEET * zone.low_m, high_m=FEET * zone.high_m
         )
         for zone in metres.zones
     )
@@ -148,10 +145,7 @@ def test_the_order_of_obstacles_does_not_matter():
 
 def test_padding_changes_nothing():
     tokens, weights = room_tokens(), amortised.load().weights
-    padded = Tokens(
-        tokens.world,
-        *(np.pad(rows, ((0, 0), (0, 3), (0, 0))) for rows in tokens[1:]),
-    )
+    padded = Tokens(tokens.world, *(np.pad(rows, ((0, 0), (0, 3), (0, 0))) for rows in tokens[1:]))
     steps, scores = attention.forward(weights, tokens, 5, 5)
     padded_steps, padded_scores = attention.forward(weights, padded, 5, 5)
     np.testing.assert_allclose(padded_steps, steps, atol=SINGLE)

@@ -69,11 +69,7 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        (
-            "ekf",
-            {},
-            "filter must be one of .*et-kf, .*kf-ortho, .*uc-kf.*, or a name .*got 'ekf'",
-        ),
+        ("ekf", {}, "filter must be one of .*et-kf, .*kf-ortho, .*uc-kf.*, or a name .*got 'ekf'"),
         ("kf", {"robust": True}, "filter 'kf' has no option 'robust'; its options are"),
         ("iekf", {"threshold": 1.0}, "its options are iterations, robust"),
         ("kf", {"noise": 0.1}, "noise must be .* ranging.RangeNoise, .* got 0.1"),
@@ -89,11 +85,7 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
         ("iekf/tags=3", {}, "filter 'iekf' has no option 'tags'; its options are"),
         ("iekf", {"iterations": 0}, "iterations must be a positive int, got 0"),
         ("et-kf", {"threshold": -1}, "threshold must be a finite number"),
-        (
-            "kf",
-            {"engine": "numpy"},
-            "engine must be one of 'auto', 'batched', 'filterpy', got",
-        ),
+        ("kf", {"engine": "numpy"}, "engine must be one of 'auto', 'batched', 'filterpy', got"),
         ("kf", {"weights": [1.0, -1.0]}, "weights must not be negative, got -1.0"),
     ],
 )

@@ -260,10 +260,7 @@ def test_an_edge_that_comes_twice_was_measured_twice():
         ({"n_nodes": 4}, "2 components"),
         ({"cycles": "some"}, "cycles must be one of"),
         ({"cycles": np.ones((1, 2))}, "one for each edge"),
-        (
-            {"cycles": 2 * np.array([[1, 1, -1]])},
-            "must have only the entries -1, 0 and 1, got 2",
-        ),
+        ({"cycles": 2 * np.array([[1, 1, -1]])}, "must have only the entries -1, 0 and 1, got 2"),
         ({"cycles": [[1, 1, 1]]}, "closed walks, but row 0 is an open one"),
         ({"exchange": CycleExchange("random")}, "order must be one of"),
         (

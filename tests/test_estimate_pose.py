@@ -282,10 +282,7 @@ def test_environment_that_hides_its_measurements_is_named():
         ({"filter": "ekf"}, "filter must be one of .*uc-kf.*, got 'ekf'"),
         ({"filter": ""}, "filter must be one of"),
         ({"filter": None}, "filter must be one of .*, got None"),
-        (
-            {"options": {"iteration": 3}},
-            "no option 'iteration'; its options are iterations",
-        ),
+        ({"options": {"iteration": 3}}, "no option 'iteration'; its options are iterations"),
         ({"filter": "kf", "options": {"robust": True}}, "'kf' has no option 'robust'"),
         ({"filter": "kf/robust=true"}, "'kf' has no option 'robust'"),
         ({"filter": "iekf/robust=true", "options": {"robust": True}}, "option 'robust' twice"),

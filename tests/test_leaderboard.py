@@ -561,10 +561,7 @@ def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, cap
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            'name = "uwb_room"\nranges = "x.csv"',
-            "must have either the key 'name'",
-        ),
+        ('name = "uwb_room"\nranges = "x.csv"', "must have either the key 'name'"),
         ("steps = 3", "must have either the key 'name'"),
         ('ranges = "ranges.csv"\nspeed = 3', "walk.toml: a recording has no key 'speed'"),
         ('ranges = "ranges.csv"\nanchors = "a.csv"', "walk.toml: a recording needs the key 'tags'"),

@@ -22,9 +22,7 @@ from rbl_gym.networks.bounds import (
 from rbl_gym.networks.sensing import proj
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from tests.helpers import assert_same
-from tests.side_by_side import (
-    actions_of,
-)
+from tests.side_by_side import actions_of
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
 

@@ -214,8 +214,7 @@ print(min(spent))
 
 
 @pytest.mark.parametrize(
-    ("name", "least"),
-    [("intel", 0.01203577), ("CSAIL", 0.0026253393), ("manhattan", 1.0205618)],
+    ("name", "least"), [("intel", 0.01203577), ("CSAIL", 0.0026253393), ("manhattan", 1.0205618)]
 )
 @pytest.mark.skipif(not G2O.is_dir(), reason="pose graphs are not beside the checkout")
 def test_pose_graphs_are_solved_and_certified(name, least):

@@ -30,10 +30,7 @@ def said(capsys, *arguments):
         (["replay", *FILES, "--start", "1,2"], "--start: must be x,y,z or x,y,z,yaw_deg"),
         (["replay", *FILES, "--filter", "ikef"], "--filter must be one of .* did you mean 'iekf'"),
         (["replay", *FILES, "--range-std-m", "-1"], "--range-std-m must be .* got -1"),
-        (
-            ["replay", *FILES, "--height-m", "1"],
-            "--height-m needs --height-std-m, its",
-        ),
+        (["replay", *FILES, "--height-m", "1"], "--height-m needs --height-std-m, its"),
         (["replay", *FILES, "--plot", "x.foo"], "--plot: must end in one of .png, .*'x.foo'"),
         (["place", "--scene", "uwb_rom"], "--scene must be one of .* did you mean 'uwb_room'"),
         (["plac"], "did you mean 'place'"),

@@ -24,14 +24,7 @@ from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import scene_files
-from rbl_gym.studies.placing import (
-    accuracy,
-    choosing,
-    contributions,
-    judging,
-    links,
-    requirements,
-)
+from rbl_gym.studies.placing import accuracy, choosing, contributions, judging, links, requirements
 from tests.helpers import Told, needs
 
 # Ten brackets in a room of 12 x 8 m with a cupboard and a thin wall.

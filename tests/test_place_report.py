@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 pytest.importorskip("shapely", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
 
-from rbl_gym.app import place_answer, place_figures, place_html, place_pdf, solids
+from rbl_gym.app import place_answer, place_figures, place_html, place_pdf
 from rbl_gym.app import place_shapes as shapes
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import polygons
@@ -295,7 +295,7 @@ def test_far_anchors_are_shown_at_the_edge():
 def test_caps_of_prisms_fill_their_outline():
     ring = np.array([(0, 0), (4, 0), (4, 3), (3, 3), (3, 1), (1, 1), (1, 3), (0, 3)], float)
     for outline in (ring, ring[::-1]):
-        triangles = outline[solids.ears(outline)]
+        triangles = outline[polygons.ears(outline)]
         areas = [abs(polygons.area(triangle)) for triangle in triangles]
         assert len(areas) == len(ring) - 2
         assert sum(areas) == pytest.approx(abs(polygons.area(ring)))

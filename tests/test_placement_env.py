@@ -15,9 +15,7 @@ from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.placement import Context
 from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_same
-from tests.side_by_side import (
-    spoil,
-)
+from tests.side_by_side import spoil
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 WORLDS: dict[str, dict[str, Any]] = {

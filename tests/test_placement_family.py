@@ -19,11 +19,7 @@ from rbl_gym.placement import Context
 from rbl_gym.placement.families import TaskFamily, described, task_family
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import FilterReward, VectorFilterReward
-from tests.side_by_side import (
-    actions_of,
-    assert_steps_alike,
-    peer_of,
-)
+from tests.side_by_side import actions_of, assert_steps_alike, peer_of
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 ROOM: dict[str, Any] = {

@@ -548,10 +548,7 @@ def test_units_of_the_header_that_are_none(tmp_path):
     [
         ({"columns": {"lidar.x": "x"}}, "one of ranges, anchors, .*; got lidar.x=x"),
         ({"columns": {"time": ""}}, "columns must map a quantity, .*; got time="),
-        (
-            {"time_unit": "min"},
-            r"time_unit must be one of 's', 'ms', .*, got 'min'",
-        ),
+        ({"time_unit": "min"}, r"time_unit must be one of 's', 'ms', .*, got 'min'"),
         ({"where": {"run": "7"}}, r"line 1: no column 'run' to choose rows by, got \['t', "),
         ({"where": {"anchor": "Z"}}, r"line 1: no row has anchor=Z, got \['A', 'B', 'C'\]"),
         ({"columns": {"*": "B_*"}}, r"line 1: no column fits 'B_\*', got \['t', "),

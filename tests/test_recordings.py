@@ -147,14 +147,8 @@ def test_truth_files(tmp_path):
 # What is wrong, the files that differ from the good ones, what the message says.
 ERRORS = {
     "empty": ({"ranges": ""}, r"ranges.csv: must have the names of the columns and rows"),
-    "only comments": (
-        {"tags": "# none\n\n"},
-        r"tags.csv: must have the names of the columns",
-    ),
-    "header only": (
-        {"anchors": "anchor,x,y,z\n"},
-        r"anchors.csv: must have rows below the names",
-    ),
+    "only comments": ({"tags": "# none\n\n"}, r"tags.csv: must have the names of the columns"),
+    "header only": ({"anchors": "anchor,x,y,z\n"}, r"anchors.csv: must have rows below the names"),
     "binary": ({"ranges": b"\x93NUMPY\x01\x00"}, r"ranges.csv: must be UTF-8 text, .* at byte 0"),
     "utf-16": ({"tags": TAGS.encode("utf-16")}, r"tags.csv: must be UTF-8 text"),
     "zeros": (
@@ -212,10 +206,7 @@ ERRORS = {
         {"anchors": ANCHORS + "A,9,9,9\n"},
         r"anchors.csv, line 5, column 'anchor': every anchor must have its own id, got 'A'",
     ),
-    "empty id": (
-        {"tags": TAGS + ",0,0,0\n"},
-        r"line 4, column 'tag': every tag must have an id",
-    ),
+    "empty id": ({"tags": TAGS + ",0,0,0\n"}, r"line 4, column 'tag': every tag must have an id"),
     "calibration twice": (
         {"calibration": CALIBRATION + "A,1,0,0,0\n"},
         r"calibration.csv, line 4, column 'tag': each link must be .*, got \('A', '1'\)",

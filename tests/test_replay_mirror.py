@@ -221,10 +221,7 @@ def test_wrong_volumes_are_named(volume, message):
 
 def test_a_volume_out_of_reach_is_named():
     settings = replay.Settings.of(volume=(None, None, None, None, 50, None))
-    with pytest.raises(
-        ValueError,
-        match=r"volume must overlap with the space that .* got \[-inf",
-    ):
+    with pytest.raises(ValueError, match=r"volume must overlap with the space that .* got \[-inf"):
         replay.recording_filter(record(CEILING, FLAT, epochs=2), settings)
     settings = replay.Settings.of(volume=(None, None, None, None, 2.5, None), below_anchors=True)
     with pytest.raises(ValueError, match="volume must have zmin below 2 m"):

@@ -33,10 +33,7 @@ def wandering():
 
 def first_state():
     filter: estimators.Filter = estimators.make(
-        "iekf-bank",
-        tags=TAGS,
-        noise=ranging.RangeNoise(0.1),
-        process=PROCESS,
+        "iekf-bank", tags=TAGS, noise=ranging.RangeNoise(0.1), process=PROCESS
     )
     return filter.initial(np.eye(3), np.zeros(3), np.eye(6))
 

@@ -72,8 +72,7 @@ def truth(seed, K=6):
 
 
 @pytest.mark.parametrize(
-    ("law", "sensor"),
-    [(None, None), (LAW, None), (LAW, TwistSensor(0.2, 0.5, frame="body"))],
+    ("law", "sensor"), [(None, None), (LAW, None), (LAW, TwistSensor(0.2, 0.5, frame="body"))]
 )
 def test_last_epoch_is_the_posterior_bound_and_earlier_ones_are_lower(law, sensor):
     anchors, tags, Q, t, twists, dt = truth(2)

@@ -18,9 +18,7 @@ from rbl_gym.wrappers import controllers
 from rbl_gym.wrappers.selection import AnchorSelectionEnv, AnchorSelectionVectorEnv
 from rbl_gym.wrappers.tasks import MobileAnchorsEnv, MobileAnchorsVectorEnv
 from tests.helpers import assert_same, score_by_hand, share_by_hand
-from tests.side_by_side import (
-    actions_of,
-)
+from tests.side_by_side import actions_of
 
 MOBILE, SELECTION = "rbl_gym:RBL/MobileAnchors-v0", "rbl_gym:RBL/AnchorSelection-v0"
 LOSSY = {"drop_probability": 0.2}

@@ -10,10 +10,7 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds.scenes import SCENES
-from tests.side_by_side import (
-    assert_steps_alike,
-    peer_of,
-)
+from tests.side_by_side import assert_steps_alike, peer_of
 
 ID = "rbl_gym:RBL/Tracking-v0"
 LOSSY = {"drop_probability": 0.2, "nlos_probability": 0.1, "reach_m": 500.0}

@@ -16,6 +16,7 @@ from rbl_gym.app.place_pdf import mounting_rows
 from rbl_gym.app.place_report import notes, tables
 from rbl_gym.app.place_svg import answer_part, plan_part
 from rbl_gym.geometry.mounts import Mounts
+from rbl_gym.geometry.polygons import prism_edges
 from rbl_gym.geometry.regions import Shell
 from rbl_gym.rendering.drawing import box_edges
 from rbl_gym.studies.placing.answer import Placed
@@ -74,7 +75,7 @@ def place_scene(placed: Placed) -> go.Figure:
         )
     for index, zone in enumerate(problem.zones):
         style = {"color": "#222222", "width": 3, "dash": "dash"}
-        edges = solids.prism_edges(zone.polygon, zone.low_m, zone.high_m)
+        edges = prism_edges(zone.polygon, zone.low_m, zone.high_m)
         shown.add_trace(
             solids.lines(edges, name="zones", legendgroup="zones", showlegend=not index, line=style)
         )

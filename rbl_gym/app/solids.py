@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.geometry.polygons import ears
+from rbl_gym.geometry.polygons import prism_mesh
 from rbl_gym.rendering.drawing import RADIUS_95, gapped
 
 # Latitudes and longitudes of an ellipsoid's mesh.
@@ -33,33 +33,12 @@ def lines(segments: FloatArray, **style: Any) -> go.Scatter3d:
     return go.Scatter3d(**xyz(gapped(segments)), mode="lines", hoverinfo="skip", **style)
 
 
-def prism_edges(corners: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the edges (3 V, 2, 3) of a prism over corners (V, 2)."""
-    bottom, top = (np.insert(corners, 2, z, axis=1) for z in (low, high))
-    rings = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in (bottom, top)]
-    return np.concatenate([*rings, np.stack([bottom, top], axis=1)])
-
-
 def prisms(found: Sequence[tuple[FloatArray, float, float]], **style: Any) -> go.Mesh3d:
     """Return prisms, each with corners (V, 2) and two heights, as one mesh with faces."""
-    points, triangles, count = [], [], 0
-    for corners, low, high in found:
-        size = len(corners)
-        points += [np.insert(corners, 2, z, axis=1) for z in (low, high)]
-        here = np.arange(size)
-        there = (here + 1) % size
-        caps = ears(corners)
-        faces = [
-            caps,
-            caps + size,
-            np.stack([here, there, there + size], axis=1),
-            np.stack([here, there + size, here + size], axis=1),
-        ]
-        triangles.append(np.concatenate(faces) + count)
-        count += 2 * size
-    i, j, k = np.concatenate(triangles).T.tolist()
+    points, triangles = prism_mesh(*zip(*found, strict=True))
+    i, j, k = triangles.T.tolist()
     return go.Mesh3d(
-        **xyz(np.concatenate(points)),
+        **xyz(points),
         i=i,
         j=j,
         k=k,

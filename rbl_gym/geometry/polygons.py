@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -161,3 +163,28 @@ def ears(corners: FloatArray) -> np.ndarray:
         found.append([a, b, c])
         left.remove(b)
     return np.array([*found, left[:3]])
+
+
+def prism_edges(ring: FloatArray, low: float, high: float) -> FloatArray:
+    """Return the edges (3 V, 2, 3) of a prism over corners (V, 2)."""
+    bottom, top = (np.insert(ring, 2, z, axis=1) for z in (low, high))
+    around = [np.stack([one, np.roll(one, -1, axis=0)], axis=1) for one in (bottom, top)]
+    return np.concatenate([*around, np.stack([bottom, top], axis=1)])
+
+
+def prism_mesh(
+    rings: Iterable[FloatArray], lows: Iterable[float], highs: Iterable[float]
+) -> tuple[FloatArray, np.ndarray]:
+    """Return prisms over rings (V, 2) as vertices (K, 3) and triangles (T, 3)."""
+    points, triangles, count = [], [], 0
+    for ring, low, high in zip(rings, lows, highs, strict=True):
+        # Corners of prisms are repeated up to a common number.
+        ring = ring[np.append(True, (np.diff(ring, axis=0) != 0).any(axis=1))]
+        size, here = len(ring), np.arange(len(ring))
+        there, caps = (here + 1) % size, ears(ring)
+        points += [np.insert(ring, 2, z, axis=1) for z in (low, high)]
+        sides = [[here, there, there + size], [here, there + size, here + size]]
+        faces = [caps[:, ::-1], caps + size, *(np.stack(side, axis=1) for side in sides)]
+        triangles.append(np.concatenate(faces) + count)
+        count += 2 * size
+    return np.concatenate(points), np.concatenate(triangles)

@@ -35,7 +35,7 @@ def random(task: PlacementTask, context: Context, rng: np.random.Generator) -> F
 def corners(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
     """Use the corners of the legal space, alternately high and low, then the midpoints of edges."""
     if isinstance(task.scene.anchor_region, Shell):
-        return _everywhere(task, context, _sphere(task.n_anchors))
+        return _everywhere(task, context, sphere(task.n_anchors))
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0)]
     rounds = itertools.count()
     places = []
@@ -48,7 +48,7 @@ def corners(task: PlacementTask, context: Context, rng: np.random.Generator) -> 
 def grid(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
     """Use a regular grid on the ceiling, or on the top of the legal space."""
     if isinstance(task.scene.anchor_region, Shell):
-        return _everywhere(task, context, _sphere(task.n_anchors))
+        return _everywhere(task, context, sphere(task.n_anchors))
     n_rows = max(1, round(task.n_anchors**0.5))
     sizes = [len(part) for part in np.array_split(np.arange(task.n_anchors), n_rows)]
     places = [
@@ -63,7 +63,7 @@ def grid(task: PlacementTask, context: Context, rng: np.random.Generator) -> Flo
 def perimeter(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
     """Place anchors at equal distances along the legal space's edge, alternately low and high."""
     if isinstance(task.scene.anchor_region, Shell):
-        return _everywhere(task, context, _sphere(task.n_anchors))
+        return _everywhere(task, context, sphere(task.n_anchors))
     low, high = task.scene.anchor_region.bounds()
     x, y = (high - low)[:2]
     stops = np.cumsum([0, x, y, x, y])
@@ -90,7 +90,7 @@ def ring(
     Arguments as in `layout`.
     """
     if isinstance(task.scene.anchor_region, Shell):
-        return _everywhere(task, context, _sphere(task.n_anchors))
+        return _everywhere(task, context, sphere(task.n_anchors))
     low, high = task.scene.anchor_region.bounds()
     levels = np.where(np.arange(task.n_anchors) % 2, high[2], low[2])
     off = np.abs(context.centre[..., 2, None] - levels)
@@ -148,7 +148,7 @@ def layout(
     return LAYOUTS[check_one_of("layout", name, list(LAYOUTS))](task, context, rng)
 
 
-def _sphere(n: int) -> FloatArray:
+def sphere(n: int) -> FloatArray:
     """Return directions (n, 3) spread evenly over the sphere (Fibonacci spiral), for shells."""
     z = 1 - (2 * np.arange(n) + 1) / n
     turn = np.pi * (3 - 5**0.5) * np.arange(n)

@@ -14,9 +14,7 @@ from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
-__all__ = [
-    "compare_hard_conditions",
-]
+__all__ = ["compare_hard_conditions"]
 
 LINK_SCENES = ("uwb_room", "drone_yard")
 CONDITIONS: dict[str, dict[str, float]] = {

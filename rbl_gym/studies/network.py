@@ -18,10 +18,7 @@ from rbl_gym.networks import g2o, graphs
 from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.g2o import PoseGraph
 
-__all__ = [
-    "Solved",
-    "solve_network",
-]
+__all__ = ["Solved", "solve_network"]
 
 WEIGHTS = ("information", "unit")
 _WORST = 5  # number of listed edges

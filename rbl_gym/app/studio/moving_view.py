@@ -9,8 +9,9 @@ import numpy as np
 
 from rbl_gym.app.studio.figures import ZoneFigures
 from rbl_gym.app.studio.maps import SliceMap, picture
-from rbl_gym.app.studio.scene_view import lines, prism_edges
+from rbl_gym.app.studio.scene_view import lines
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry.polygons import prism_edges
 from rbl_gym.placement.building import Zone
 
 ANCHOR, SELECTED, FIXED = (24, 100, 171), (232, 89, 12), (73, 80, 87)

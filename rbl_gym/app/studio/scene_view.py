@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.app.place_shapes import Solid, solids
+from rbl_gym.app.place_shapes import solids
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.polygons import ears
+from rbl_gym.geometry.polygons import prism_edges, prism_mesh
 from rbl_gym.geometry.regions import Shell, Walls
 from rbl_gym.placement.building import Problem
 
@@ -134,11 +134,12 @@ def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None)
         lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), EDGE, 1)
     tall = low[2] + _TALL * (high - low)[2]
     for name, opacity, which in (("racks", 0.85, False), ("walls-within", 0.3, True)):
-        shown = [solid for solid in solids(problem) if (solid.high_m > tall) == which]
+        shown = [s[:3] for s in solids(problem) if (s.high_m > tall) == which]
         if shown:
+            faces = prism_mesh(*zip(*shown, strict=True))
             scene.add_mesh_simple(
-                f"/room/{name}", *mesh_of(shown), color=RACK, opacity=opacity,
-                flat_shading=True, side="double",
+                f"/room/{name}", *faces, color=RACK, opacity=opacity, flat_shading=True,
+                side="double",
             )  # fmt: skip
 
 
@@ -189,13 +190,6 @@ def box_edges(low: FloatArray, high: FloatArray) -> FloatArray:
     return prism_edges(ring, low[2], high[2])
 
 
-def prism_edges(ring: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the edges (3 V, 2, 3) of a prism over corners (V, 2)."""
-    bottom, top = (np.insert(ring, 2, z, axis=1) for z in (low, high))
-    around = [np.stack([one, np.roll(one, -1, axis=0)], axis=1) for one in (bottom, top)]
-    return np.concatenate([*around, np.stack([bottom, top], axis=1)])
-
-
 def _room_faces(low: FloatArray, high: FloatArray) -> tuple[FloatArray, np.ndarray]:
     """Return walls and ceiling of a room, with their front sides outwards."""
     x, y, z = zip(low, high, strict=True)
@@ -217,23 +211,3 @@ def _mount_faces(mounts: Mounts) -> tuple[FloatArray, np.ndarray]:
             vertices += [(a0, a1, low), (b0, b1, low), (b0, b1, high), (a0, a1, high)]
             triangles += [(count, count + 1, count + 2), (count, count + 2, count + 3)]
     return np.array(vertices).reshape(-1, 3), np.array(triangles, int).reshape(-1, 3)
-
-
-def mesh_of(shown: list[Solid]) -> tuple[FloatArray, np.ndarray]:
-    """Return solids as vertices (K, 3) and triangles (T, 3)."""
-    points, triangles, count = [], [], 0
-    for ring, low, high, _ in shown:
-        # Corners of prisms are repeated up to a common number.
-        ring = ring[np.append(True, (np.diff(ring, axis=0) != 0).any(axis=1))]
-        size, here = len(ring), np.arange(len(ring))
-        there, caps = (here + 1) % size, ears(ring)
-        points += [np.insert(ring, 2, z, axis=1) for z in (low, high)]
-        faces = [
-            caps[:, ::-1],
-            caps + size,
-            np.stack([here, there, there + size], axis=1),
-            np.stack([here, there + size, here + size], axis=1),
-        ]
-        triangles.append(np.concatenate(faces) + count)
-        count += 2 * size
-    return np.concatenate(points), np.concatenate(triangles)

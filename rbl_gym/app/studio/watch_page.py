@@ -13,6 +13,7 @@ from rbl_gym.app.studio import scene_view
 from rbl_gym.app.studio.watch_panel import CHARTS_WIDTH, WatchPanel
 from rbl_gym.app.studio.watch_view import WatchView
 from rbl_gym.app.studio.worker import Worker, in_order
+from rbl_gym.geometry.polygons import prism_edges
 from rbl_gym.studies.watching.frames import Frame
 from rbl_gym.studies.watching.live import CALM, Disturbances
 from rbl_gym.studies.watching.program import Program
@@ -45,7 +46,7 @@ class WatchPage:
         if self.frames[0].picture is None:
             scene_view.draw_room(server, program.room, _FLOOR)
             for index, zone in enumerate(program.room.zones):
-                edges = scene_view.prism_edges(zone.polygon, zone.low_m, zone.high_m)
+                edges = prism_edges(zone.polygon, zone.low_m, zone.high_m)
                 scene_view.lines(server.scene, f"/zones/{index}", edges, scene_view.RACK, 1)
         extent = scene_view.extent_of(program.room)
         self._view = WatchView(server.scene, extent, program.tags)

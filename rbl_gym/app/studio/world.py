@@ -13,6 +13,7 @@ import numpy as np
 from rbl_gym.checks import FloatArray, as_tuples
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.placement.building import Problem
+from rbl_gym.placement.layouts import sphere
 from rbl_gym.placement.sample import Sample, sample
 from rbl_gym.placement.setting import Setting
 from rbl_gym.studies.placing.accuracy import spread_places
@@ -117,10 +118,7 @@ class World:
 def _tags(tags: FloatArray, count: int, size_m: float) -> FloatArray:
     """Return tags (count, 3) of an extent: the body's own, or spread evenly on a sphere."""
     if count != len(tags):
-        z = 1 - (2 * np.arange(count) + 1) / count
-        turn = np.pi * (3 - 5**0.5) * np.arange(count)
-        flat = np.sqrt(1 - z**2)
-        tags = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=-1)
+        tags = sphere(count)
     return tags * (size_m / float(np.ptp(tags, axis=0).max()))
 
 

@@ -88,10 +88,7 @@ def train(
         torch.set_num_threads(threads)
     tell(steps)
     meta = {"task": name, "seed": seed, "steps": steps, "algorithm": algorithm}
-    seconds = {
-        "seconds": time.perf_counter() - begin,
-        "cpu_seconds": time.process_time() - cpu,
-    }
+    seconds = {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
     return make(meta), {**meta, **seconds, **figures}
 
 
