@@ -56,9 +56,9 @@ def train(
 
     Returns
     -------
-    The deterministic policy, and figures: learning curve (environment steps, mean return of the
-    episodes since the previous point), seconds, and the environment's share of them (None if it
-    cannot be measured).
+    The deterministic policy, and figures: steps in whole rollouts, learning curve (environment
+    steps, mean return of the episodes since the previous point), seconds, and the environment's
+    share of them (None if it cannot be measured).
 
     Raises
     ------
@@ -73,23 +73,22 @@ def train(
     torch.set_num_threads(1)
     learn = _taught if algorithm in _TAUGHT else _explored
     begin, cpu = time.perf_counter(), time.process_time()
-    told = 0
+    done = 0
 
     def tell(more: int) -> None:
         # Whole rollouts may end after the number of steps, or before it.
-        nonlocal told
-        more = min(more, steps - told)
-        told += more
-        advance(more)
+        nonlocal done
+        advance(min(done + more, steps) - min(done, steps))
+        done += more
 
     try:
         make, figures = learn(algorithm, task, steps, seed, tell)
     finally:
         torch.set_num_threads(threads)
-    tell(steps)
+    advance(max(steps - done, 0))
     meta = {"task": name, "seed": seed, "steps": steps, "algorithm": algorithm}
     seconds = {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
-    return make(meta), {**meta, **seconds, **figures}
+    return make(meta), {**meta, "steps": done, **seconds, **figures}
 
 
 def check_training(task: RlTask, seed: int, algorithm: str | None = None) -> str:
@@ -180,7 +179,6 @@ def _explored(
     curve, cpu = _Curve(advance), time.process_time()
     model.learn(steps, callback=curve.callback())
     figures = {
-        "steps": int(model.num_timesteps),
         "env_share": envs.seconds / (time.process_time() - cpu),
         "curve": curve.points,
     }
