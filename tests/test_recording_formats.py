@@ -143,6 +143,18 @@ def test_units_of_time(tmp_path, unit, scale, start, step):
         assert said == (unit != "s" and not options)
 
 
+def test_names_of_columns_in_other_spellings(tmp_path):
+    want = read(tmp_path)
+    header, *rows = LONG.splitlines()
+    assert header == "t,anchor,tag,range"
+    texts = {"ranges": "\n".join(["Timestamp (s),Anchor ID,Tag-ID,Distance [m]", *rows])}
+    for name, text in (("anchors", ANCHORS), ("tags", TAGS)):
+        texts[name] = "\n".join(["ID,X [m],Y [m],Z [m]", *text.splitlines()[1:]])
+    found = read(tmp_path, **texts)
+    assert_same(found, want)
+    assert found.report.notes == ()
+
+
 @pytest.mark.parametrize(("unit", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_unit_of_the_times_of_a_truth(tmp_path, unit, scale):
     """Poses may be rare: the unit follows from the length of the log."""

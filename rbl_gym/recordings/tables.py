@@ -27,18 +27,20 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # What loggers write for a missing number.
 _MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-", "inf", "-inf", "+inf"))
-# Other common names of a column. A unit may follow: time_ms, range_mm.
+# Common names of a column, in any case, with spaces for underscores. A unit may follow: time_ms.
 _OTHER_NAMES = {
     "t": ("t", "time", "timestamp", "stamp"),
     "range": ("range", "distance", "dist"),
     "anchor": ("anchor", "anchor_id"),
     "tag": ("tag", "tag_id"),
     "run": ("run", "run_id"),
+    "id": ("id", "name"),
     **{f"a{axis}": (f"a{axis}", f"anchor_{axis}") for axis in "xyz"},
+    **{name: (name,) for name in (*"xyz", "std", "var", "valid")},
 }
 _QUANTITIES = {
-    *_OTHER_NAMES, *itertools.chain(*_OTHER_NAMES.values()), "std", "var", "valid", "run", "id",
-    *"xyz", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz", "left", "right",
+    *_OTHER_NAMES, *itertools.chain(*_OTHER_NAMES.values()),
+    "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz", "left", "right",
 }  # fmt: skip
 _UNIT = re.compile(
     "\\s*[\\[(](|s|ms|[u\u00b5\u03bc]s|ns|m|cm|mm|deg|rad)[\\])]$|_(s|ms|us|ns|m|cm|mm)$"
@@ -319,7 +321,9 @@ def _roles(
         if role in names or role in header:
             continue
         like = [
-            name for name in header if name not in taken and _UNIT.sub("", name.lower()) in others
+            name
+            for name in header
+            if name not in taken and re.sub(r"[\s-]+", "_", _UNIT.sub("", name.lower())) in others
         ]
         if len(like) == 1:
             names[role] = like[0]

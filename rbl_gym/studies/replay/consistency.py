@@ -23,8 +23,9 @@ _BLOCKS = 20
 # The data also contradict it in two other cases, each with at least `_FEWEST` ranges. First, the
 # mean squared whitened innovation of an anchor or tag (rejected ones clipped) exceeds
 # `_MOST_SQUARE`, and `_BEYOND_OTHERS` times the median over all of them. Second, more than half of
-# the innovations of a link exceed `_FAR` standard deviations.
-_MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
+# the innovations of a link exceed `_FAR` standard deviations. `_FAR_BEYOND` times the median is
+# enough: noise that is assumed too large does not hide a bad anchor.
+_MOST_SQUARE, _BEYOND_OTHERS, _FAR_BEYOND, _FAR, _FEWEST = 2.5, 2.0, 3.0, 2.0, 20
 
 
 def consistency_figures(found: Innovations, recording: Recording) -> dict[str, Any]:
@@ -50,15 +51,34 @@ def contradicts(found: Innovations, recording: Recording) -> bool:
     if whole[0] or parts.sum() >= max(2, _PART * len(parts)):
         return True
     links = recording.links
-    z = np.divide(found.innovation, found.std, out=np.zeros(links.shape), where=links)
-    squares, far = np.minimum(z**2, GATE**2), np.abs(z) > _FAR
+    z = _whitened(found, links)
+    far = np.abs(z) > _FAR
     for other in ((0, 1), (0, 2)):
-        count = links.sum(axis=other)
-        mean = (squares.sum(axis=other) / np.maximum(count, 1))[count >= _FEWEST]
-        if len(mean) and mean.max() > max(_MOST_SQUARE, _BEYOND_OTHERS * np.median(mean)):
-            return True
+        mean = _mean_squares(z, links, other)
+        if len(mean):
+            usual = np.median(mean)
+            most = max(_MOST_SQUARE, _BEYOND_OTHERS * usual)
+            if mean.max() > min(most, _FAR_BEYOND * usual):
+                return True
     count = links.sum(axis=0)
     return bool(((far.sum(axis=0) > 0.5 * count) & (count >= _FEWEST)).any())
+
+
+def typical_square(found: Innovations, recording: Recording) -> float:
+    """Return the mean squared whitened innovation of the median anchor: 1 if consistent."""
+    links = recording.links
+    mean = _mean_squares(_whitened(found, links), links, (0, 2))
+    return float(np.median(mean)) if len(mean) else 1.0
+
+
+def _whitened(found: Innovations, links: BoolArray) -> FloatArray:
+    return np.divide(found.innovation, found.std, out=np.zeros(links.shape), where=links)
+
+
+def _mean_squares(z: FloatArray, links: BoolArray, axes: tuple[int, int]) -> FloatArray:
+    """Return mean squares of anchors or tags with enough ranges; rejected ranges are clipped."""
+    count = links.sum(axis=axes)
+    return (np.minimum(z**2, GATE**2).sum(axis=axes) / np.maximum(count, 1))[count >= _FEWEST]
 
 
 def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatArray, ...]:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.causes import Cause, likely_causes
-from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REJECTED, consistency_figures
-from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.consistency import (
+    MOST_NIS,
+    MOST_REJECTED,
+    consistency_figures,
+    typical_square,
+)
+from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import Track
 
 # Below this NIS per degree of freedom the filter is pessimistic.
@@ -35,8 +41,21 @@ def diagnose(
         # The tested faults concern ranges, not their differences.
         text = _subject(figures) + "Look at the residuals of anchors, tags and links; see --tune."
         return {**figures, "causes": []}, [text]
+    if (usual := typical_square(found, recording)) < _WIDE:
+        # With the assumed noise no fault would be likely.
+        recording, settings = _with_less_noise(recording, settings, math.sqrt(usual))
     causes = likely_causes(recording, settings, found, track[1:3])
     return {**figures, "causes": [cause._asdict() for cause in causes]}, [_warning(figures, causes)]
+
+
+def _with_less_noise(
+    recording: Recording, settings: Settings, share: float
+) -> tuple[Recording, Settings]:
+    """Return recording and settings with a share of the standard deviation of the ranges."""
+    if recording.range_std is not None and settings.range_std_m is None:
+        return recording._replace(range_std=share * recording.range_std), settings
+    std = settings.range_std_m or DEFAULT_RANGE_STD_M
+    return recording, settings.changed(range_std_m=share * std)
 
 
 def _subject(figures: dict[str, Any]) -> str:

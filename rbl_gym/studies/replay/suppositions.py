@@ -67,6 +67,9 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
             changed = recording._replace(**{field: scale * getattr(recording, field)})
             text = f"the positions of the {field} look like {unit}"
             yield Supposition("units", text, _with(trial, changed))
+    halved = _with(trial, recording._replace(ranges=0.5 * recording.ranges))
+    text = "the ranges look like distances there and back, twice too long"
+    yield Supposition("units", text, halved, scale=0.5)
     for bias in _BIASES_M:
         yield _common_bias(trial, bias)
     if settings.knowledge.planar:
