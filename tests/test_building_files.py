@@ -541,3 +541,69 @@ def test_the_reference_has_every_key_of_the_format():
         rows = re.findall(r"^\| (`[^|]+) \|", sections[name], re.M)
         named = set(re.findall(r"`(\w+)`", " ".join(rows)))
         assert named == {key for form in table.forms for key in form.keys}, name
+
+
+# --- outside the walls ---------------------------------------------------------------------------
+
+
+def notes_of(tables) -> str:
+    return " ".join(scene_files.of_mapping(tables).notes)
+
+
+@needs("shapely")
+def test_what_lies_outside_the_walls_is_named_with_its_distance():
+    assert notes_of(OFFICE) == ""
+    # One and a half metres of 16 beyond the face at x = 12.15, and the reentrant corner.
+    wide = [[0.6, 10.6], [13.65, 10.6], [13.65, 15.4], [0.6, 15.4]]
+    said = notes_of(changed("zones.1.polygon", wide))
+    outer = (13.65 - 12.15) * 4.8 / (13.05 * 4.8)
+    assert said == (
+        f"zone 'meeting room' lies outside the walls: {100 * outer:.2g} % of its area, up to 1.5 m "
+        "away from them."
+    )
+    away = [[-9, 2], [-3, 2], [-3, 8], [-9, 8]]
+    assert "zone 'meeting room' lies outside the walls: all of it, up to 8.85 m" in notes_of(
+        changed("zones.1.polygon", away)
+    )
+    assert "anchors.fixed[0] lies outside the walls: up to 0.85 m" in notes_of(
+        changed("anchors.fixed", [[25.0, 0.2, 2.6]])
+    )
+    assert "mount 'partition 1' lies outside the walls" in notes_of(
+        changed("mounts.1.line", [[6, 17], [11, 17]])
+    )
+    assert "mount 'ceiling' reaches 2 m above the walls, which end at 3 m" in notes_of(
+        changed("mounts.2.height_m", 5.0)
+    )
+    assert "reaches 0.3 m below the walls, which begin at 0 m" in notes_of(
+        changed("zones.0.low_m", -0.3)
+    )
+
+
+@needs("shapely")
+def test_the_region_of_the_command_is_checked_too():
+    problem = scene_files.of_mapping(OFFICE, region=((1, 1, 0.5), (30, 9, 1.5)))
+    assert problem.notes[0].startswith("the region lies outside the walls: 20 % of its area, up to")
+
+
+@needs("shapely")
+def test_walls_that_are_no_outline_give_no_notes():
+    # Only the meeting room's walls: the building is larger than what they enclose.
+    tables = changed("walls.0", None)
+    assert notes_of(tables) == ""
+    # A door in the outer wall does not open the outline.
+    line = [[3, 0], [24, 0], [24, 10], [12, 10], [12, 16], [0, 16], [0, 0], [1.5, 0]]
+    tables = changed("walls.0.line", line)
+    tables["walls"][0]["closed"] = False
+    assert notes_of(tables) == ""
+    assert "the walls" in notes_of(changed("anchors.fixed", [[25.0, 0.2, 2.6]], tables))
+
+
+@needs("shapely")
+def test_the_origin_of_a_drawing_may_be_that_of_a_national_grid_in_millimetres():
+    tables = changed("plan", {"units": "mm", "zero": [3.45e9, 5.4e9]})
+    plan = scene_files.of_mapping(tables).plan
+    assert plan is not None
+    assert plan.zero == (3.45e9, 5.4e9)
+    tables["plan"]["zero"] = [1e13, 0]
+    with pytest.raises(ValueError, match=re.escape("plan.zero must have numbers of at most 1e+12")):
+        scene_files.of_mapping(tables)

@@ -226,7 +226,7 @@ def test_the_command_writes_a_table_a_picture_a_page_and_figures(tmp_path, capsy
 def test_the_figures_have_these_names(placed):
     result = json.loads(json.dumps(placed.result, allow_nan=False))
     assert set(result) == {
-        "scene", "seed", "n_anchors", "verdict", "survive", "zones", "region", "obstacles",
+        "scene", "seed", "n_anchors", "verdict", "survive", "notes", "zones", "region", "obstacles",
         "tags_m", "method", "anchors", "cost", "coplanar", "out_of_plane", "next_anchor",
         "predicted", "criteria", "layouts", "check", "against_number", "survey",
     }  # fmt: skip

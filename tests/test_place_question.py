@@ -436,7 +436,12 @@ def test_a_zone_that_is_too_close_to_tell_is_explained():
         "share_low": 0.9461, "share_high": 0.9548, "required": {"share": 0.95},
     }  # fmt: skip
     (warning,) = place_answer.warnings(
-        {"coplanar": False, "zones": [row, {"verdict": "pass"}], "check": {"filters": {}}}
+        {
+            "notes": [],
+            "coplanar": False,
+            "zones": [row, {"verdict": "pass"}],
+            "check": {"filters": {}},
+        }
     )
     assert warning.startswith(
         "aisle is too close to tell: 95.1 % of 9600 places are within the limits (95 % interval "
@@ -449,7 +454,12 @@ def test_a_zone_that_is_too_close_to_tell_is_explained():
 def test_a_check_that_contradicts_the_prediction_is_told():
     good = {"found": 1.0, "holds": True, "position_ratio": 1.0, "rotation_ratio": 1.0}
     bad = good | {"holds": False, "position_ratio": 3.7}
-    result = {"coplanar": False, "zones": [], "check": {"filters": {"a": good, "b": bad}}}
+    result = {
+        "notes": [],
+        "coplanar": False,
+        "zones": [],
+        "check": {"filters": {"a": good, "b": bad}},
+    }
     (warning,) = place_answer.warnings(result)
     assert "the errors of 'b' are 3.7 times the predicted ones" in warning
     assert "mirror" not in warning

@@ -225,6 +225,14 @@ def test_the_chart_says_if_the_search_was_not_for_the_margin(method, own, told):
     assert ("minimised b, not this margin" in axes.get_xlabel()) == told
 
 
+def test_colours_show_errors_near_the_limit_beside_large_ones():
+    free = np.ones((1, 4), bool)
+    layers = [shapes.Layer(None, 0, 1, 0, 1, np.array([[0.1, 0.2, 0.4, 25.0]]), free)]
+    assert shapes.colour_range(layers, 0.3) == (0.1, pytest.approx(0.9))
+    low, high = shapes.colour_range(layers, None)
+    assert (low, high > 20) == (0.1, True)
+
+
 def test_labels_lie_on_no_other(placed):
     """The texts of all maps, as they are drawn; anchors may stand as close as they like."""
     rng = np.random.default_rng(0)

@@ -54,9 +54,10 @@ def headline(result: dict[str, Any]) -> str:
 def warnings(result: dict[str, Any]) -> list[str]:
     """Return what a reader has to know beside the verdict.
 
-    A mirror image, zones that are too close to tell, a check that contradicts the prediction.
+    Notes on the file, a mirror image, zones that are too close to tell, a check that contradicts
+    the prediction.
     """
-    found = []
+    found = list(result["notes"])
     if result["coplanar"]:
         found.append(
             "All anchors lie in one plane. Each pose has a mirror image on the other side of the "

@@ -23,6 +23,8 @@ WITHIN, BEYOND, NOTHING = "#56b4e9", "#d55e00", "#c9ced2"
 _FAR = 4.0
 # The colours of a map span at least this ratio, so that small variations look small.
 _LEAST_CONTRAST = 1.15
+# The colours of a map end at this many times the limit.
+_MOST_OF_LIMIT = 3.0
 # A hole of a zone is joined to its outline by a slit of this width, metres.
 _SLIT_M = 0.003
 
@@ -239,12 +241,17 @@ def _edges(centres: FloatArray) -> tuple[float, float]:
 
 
 def colour_range(shown: list[Layer], limit: float | None) -> tuple[float, float]:
-    """Return the colour range of all zones; it includes a limit that is close to it."""
+    """Return the colour range of all zones; it shows a limit that is close to it.
+
+    Errors far above the limit all have the last colour, so that those near it can be told apart.
+    """
     values = np.concatenate([layer.values[layer.free] for layer in shown])
     values = values[np.isfinite(values)]
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(np.quantile(values, 0.99))
+    if limit is not None:
+        high = min(high, _MOST_OF_LIMIT * max(limit, low))
     # Include a close limit; a far one would make the map one colour.
     if limit is not None and limit < 1.5 * high:
         low, high = min(low, limit), max(high, 1.1 * limit)

@@ -59,6 +59,7 @@ def _plan(options: argparse.Namespace) -> int:
 
         problem = scene_files.of_mapping(toml_text.plain(tables), name=Path(path).stem)
         figures.save_figure(place_figures.building_figure(problem), options.plot)
+        result["said"] = said = [*said, *problem.notes]
     if write_json(result, options.json):
         plan_report.print_plan(layers, said)
         print_files(building=options.out, picture=options.plot)

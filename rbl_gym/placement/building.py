@@ -136,12 +136,15 @@ class Problem(PlacementTask):
         Fixed anchors (F, 3), metres.
     plan
         The drawing of the building, or None.
+    notes
+        Doubtful parts of the file, in words.
     """
 
     n_poses: int = 64
     zones: tuple[Zone, ...] = ()
     fixed: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     plan: Plan | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check nothing: `file_checks` does, and a drawing may show any scene."""

@@ -41,7 +41,7 @@ class Key(NamedTuple):
     needed, default
         Whether the key is required, and its default otherwise.
     low, high
-        Limits of a number.
+        Limits of a number. `high` of a spot: of its distance to the origin.
     choices
         Allowed values of a choice.
     """
@@ -384,6 +384,7 @@ FORMAT: dict[str, Table] = {
                         "spot",
                         "point [x, y] of the drawing, in its units, that is the origin of the file",
                         default=[0, 0],
+                        high=1e12,  # a national grid in millimetres
                     ),
                 }
             ),

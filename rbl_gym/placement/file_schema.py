@@ -77,7 +77,7 @@ def _key_schema(key: Key) -> dict[str, Any]:
         found = {"description": key.doc, "enum": list(key.choices)}
     if key.low > -math.inf:
         found["minimum"] = key.low
-    if key.high < math.inf:
+    if key.high < math.inf and key.kind != "spot":
         found["maximum"] = key.high
     if key.default is not None:
         found["default"] = key.default

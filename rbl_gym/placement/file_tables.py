@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -89,7 +90,7 @@ def _checked(name: str, value: Any, key: Key) -> Any:
     if isinstance(value, list) and len(value) > _MOST_POINTS:
         raise ValueError(f"{name} must have at most {_MOST_POINTS} points, got {len(value)}")
     if key.kind in ("spot", "place"):
-        return _vector(name, value, 2 if key.kind == "spot" else 3)
+        return _vector(name, value, 2 if key.kind == "spot" else 3, key.high)
     if key.kind == "places":
         return _places(name, value)
     if key.kind in ("line", "polygon"):
@@ -105,10 +106,13 @@ def check_text(name: str, value: Any) -> str:
     return value
 
 
-def _vector(name: str, value: Any, size: int) -> tuple[float, ...]:
+def _vector(name: str, value: Any, size: int, most: float) -> tuple[float, ...]:
     array = check_array(name, value, (size,))
     far = np.abs(array).max()
-    if far > _FARTHEST_M:
+    # A larger limit of its own is in the units of a drawing.
+    if most < math.inf and far > most:
+        raise ValueError(f"{name} must have numbers of at most {most:g}, got {far:g}")
+    if most == math.inf and far > _FARTHEST_M:
         raise ValueError(f"{name} must lie within {_FARTHEST_M:g} m of the origin, got {far:g} m")
     if array.ndim != 1:
         numbers = {2: "two", 3: "three"}[size]

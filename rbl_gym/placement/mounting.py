@@ -46,7 +46,7 @@ def cut_mounts(mounts: list[Mount], obstacles: Obstacles, forbidden: Prisms) -> 
     A position on a surface is covered if the point a millimetre in front of it lies in an obstacle.
     Other positions are covered if they lie in an obstacle themselves.
     """
-    shapely = _shapely()
+    shapely = shapely_module()
     covers = _solids(shapely, _prisms_of(obstacles), 0.0)
     bans = _solids(shapely, forbidden, _GROWN_M)
     pieces, face = [], []
@@ -168,7 +168,8 @@ def _simplices(shapely: Any, shape: Any) -> list[FloatArray]:
     return found
 
 
-def _shapely() -> Any:
+def shapely_module() -> Any:
+    """Return shapely; the error without it names the extra."""
     try:
         import shapely  # an extra
     except ModuleNotFoundError as error:

@@ -10,6 +10,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from rbl_gym.placement.file_lines import line_of
 from rbl_gym.placement.file_tables import as_table, check_text, read_table
 from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, rectangle, show
 from rbl_gym.placement.mounting import cut_mounts
+from rbl_gym.placement.outline import outside
 from rbl_gym.worlds import scenes
 
 __all__ = ["Problem", "inside", "load", "of_mapping", "problem", "with_anchors"]
@@ -148,7 +150,7 @@ def of_mapping(
         zones = (_region(tables["region"]),)
     else:
         zones = _zones(lists["zones"])
-    return check_problem(
+    found = check_problem(
         Problem.of(
             zones,
             check_n_anchors(number),
@@ -166,6 +168,9 @@ def of_mapping(
             initial_translation_m=prior["position_m"],
         )
     )
+    if not lists["mounts"]:
+        return found
+    return replace(found, notes=outside(found, walls, read_mounts(lists["mounts"], walls)))
 
 
 def with_anchors(problem: Problem, n_anchors: int) -> Problem:

@@ -209,6 +209,7 @@ def _result(
         "n_anchors": len(anchors),
         "verdict": verdict(judged),
         "survive": survive,
+        "notes": list(problem.notes),
         "zones": [zone_row(*pair) for pair in zip(judged, edges, strict=True)],
         "region": {"low_m": low.tolist(), "high_m": high.tolist()},
         "obstacles": _obstacles(problem),

@@ -40,7 +40,7 @@ _COARSE, _FINE = 6, 4
 _FINE_PLACES, _FINE_CANDIDATES = 1600, 100
 # The finer searches end if the error at the required share is this many times the limit: at the
 # first two, and at the others.
-_HOPELESS = 1.2, 1.08
+_HOPELESS = 1.15, 1.06
 # All choices are tried if there are at most this many.
 _MOST_CHOICES = 3000
 
