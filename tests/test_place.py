@@ -360,6 +360,16 @@ def test_what_cannot_be_read_is_a_usage_error(options, capsys):
     assert "must" in capsys.readouterr().err
 
 
+def test_the_building_may_be_named_without_the_option(capsys):
+    for words in (["place", "nowhere.toml"], ["place", "--scene", "nowhere.toml"]):
+        assert main(words) == 2
+        assert "place: nowhere.toml: No such file" in capsys.readouterr().err
+    for words in (["place"], ["place", "uwb_room", "--scene", "hall"]):
+        with pytest.raises(SystemExit, match="2"):
+            main(words)
+        assert "--scene" in capsys.readouterr().err
+
+
 def test_a_missing_extra_is_named(monkeypatch, capsys):
     find = __import__("importlib.util").util.find_spec
     monkeypatch.setattr(

@@ -37,12 +37,10 @@ def add_place(commands: Any) -> None:
         description="Design a layout of anchors, predict its accuracy, compare it with the usual "
         "layouts and check it with filters. See docs/placement.md for the file format.",
     )
-    place.add_argument(
-        "--scene",
-        required=True,
-        metavar="NAME|F",
-        help="a named scene, a building file .toml or .json, or a plan .dxf, .geojson, .png, .jpg",
-    )
+    scene = place.add_mutually_exclusive_group(required=True)
+    text = "a named scene, a building file .toml or .json, or a plan .dxf, .geojson, .png, .jpg"
+    scene.add_argument("scene", nargs="?", metavar="NAME|F", help=text)
+    scene.add_argument("--scene", dest="scene_", metavar="NAME|F", help="the same, as an option")
     place.add_argument(
         "--anchors",
         type=_numbers,
@@ -118,6 +116,7 @@ def add_place(commands: Any) -> None:
 
 
 def _place(options: argparse.Namespace) -> int:
+    options.scene = options.scene or options.scene_
     check_html(options)
     check_report_options(options)
     from rbl_gym.placement import scene_files
