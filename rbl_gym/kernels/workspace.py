@@ -7,12 +7,19 @@ update of the iterated EKF.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from numba.core import cgutils
 from numba.core.types import Array, float64, intp
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
+
+
+def _intrinsic(function: Callable[[Any, Any], Any]) -> Callable[[tuple[int, ...]], Any]:
+    """Return a function of a shape for kernels to call, from one that generates its code."""
+    made: Any = intrinsic(prefer_literal=True)(function)
+    return made
 
 
 def _array_on_stack(shape: Any, zero: bool) -> tuple[Any, Any]:
@@ -42,7 +49,7 @@ def _array_on_stack(shape: Any, zero: bool) -> tuple[Any, Any]:
     return kind(shape), generate
 
 
-@intrinsic(prefer_literal=True)
+@_intrinsic
 def workspace(context: Any, shape: Any) -> Any:
     """Return an array of a constant shape with arbitrary values.
 
@@ -51,7 +58,7 @@ def workspace(context: Any, shape: Any) -> Any:
     return _array_on_stack(shape, zero=False)
 
 
-@intrinsic(prefer_literal=True)
+@_intrinsic
 def zeros(context: Any, shape: Any) -> Any:
     """Return a `workspace` of zeros."""
     return _array_on_stack(shape, zero=True)
