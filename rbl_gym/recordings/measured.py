@@ -323,10 +323,15 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         said.note(table.path, f"{sum(shown.values())} of {total} ranges are left out: {causes}")
 
 
+def _in_file(table: Table, column: str) -> str:
+    """Return the column of the first anchor of a time difference for `anchor`."""
+    return "anchor_a" if column == "anchor" and "anchor_a" in table.columns else column
+
+
 def _unknown_ids(measured: Measured, table: Table, cause: str) -> str:
     """Return the unknown anchors or tags in brackets; nothing for other causes."""
     column = _CAUSES[cause][1]
-    column = "anchor_a" if column == "anchor" and "anchor_a" in table.columns else column
+    column = _in_file(table, column)
     if "unknown" not in cause or column not in table.columns:
         return ""
     rows = measured.row[measured.cause == _NAMES.index(cause)]
@@ -343,7 +348,7 @@ def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str
     row = int(measured.row[at])
     name = {"range": measured.columns, "std": measured.std_columns}.get(column, [column])
     name = name[measured.column[at]] if len(name) > 1 else name[0]
-    name = "anchor_a" if name == "anchor" and "anchor_a" in table.columns else name
+    name = _in_file(table, name)
     got = repr(table.columns[name][row])
     if "unknown" in cause:
         must += f" must be one of {', '.join(ids[column == 'tag'])!s:.200}"
