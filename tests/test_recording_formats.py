@@ -143,6 +143,19 @@ def test_units_of_time(tmp_path, unit, scale, start, step):
         assert said == (unit != "s" and not options)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LONG.replace("0.0,A", "12:00:00.0,A"), "column 't': times of day need a date.*'12:00:00"),
+        ("Logger v1, device 7\n" + LONG, "line 2: .*lines above the header.* line 1, must begin"),
+        (LONG.replace("2.25", "2,25").replace("2.5", "2,5"), "line 2: .*must be a semicolon or a"),
+    ],
+)
+def test_what_loggers_and_spreadsheets_write_is_explained(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path, text)
+
+
 def test_names_of_columns_in_other_spellings(tmp_path):
     want = read(tmp_path)
     header, *rows = LONG.splitlines()

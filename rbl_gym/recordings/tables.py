@@ -165,6 +165,11 @@ class Table(NamedTuple):
             if stamps is not None and (said == "iso" or np.isfinite(stamps[0])):
                 self.check(np.isfinite(stamps), "t", "must be a time of ISO 8601")
                 return stamps, "" if said else "times are read as ISO 8601"
+        self.check(
+            np.array([":" not in cell for cell in self.columns["t"]]),
+            "t",
+            "times of day need a date, as in ISO 8601: 2024-05-01T12:00:00.5; or give seconds",
+        )
         values, note = self.numbers("t"), ""
         if said is None:
             said, note = found_unit(values)

@@ -119,7 +119,13 @@ def _rows(
             if len(row) < width and line == len(lines) and rows:
                 return rows, numbers, line  # no line feed at the end
             if len(row) != width:
-                raise csv.Error(f"must have {width} cells like the header, got {len(row)}")
+                hint = ""
+                if comma == "," and len(row) > width and any(map(is_number, row)):
+                    hint = "; with commas in numbers the separator must be a semicolon or a tab"
+                elif not rows:
+                    hint = f"; lines above the header, which is taken to be line {start + 1}, must "
+                    hint += "begin with #"
+                raise csv.Error(f"must have {width} cells like the header, got {len(row)}{hint}")
             rows.append(row)
             numbers.append(line)
     except csv.Error as error:
@@ -152,7 +158,7 @@ def _read_lines(path: str) -> list[str]:
         raise ValueError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path}: must be UTF-8 text, {error.reason} at byte {error.start}"
+            f"{path}: must be UTF-8 text, {error.reason} at byte {error.start}; save it as UTF-8"
         ) from error
 
 

@@ -253,9 +253,9 @@ def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
     best = min(_SHIFTS, key=left)
     best = min(best + _FINE_SHIFTS, key=left)
     if abs(best) > 0.01:
-        side = "late" if best > 0 else "early (or the filter lags: see --walk-m)"
+        side = "ahead" if best > 0 else "behind (or the filter lags: see --walk-m)"
         yield (
-            f"the truth's stamps look about {abs(best):.2f} s {side}; see --time-offset",
+            f"the truth's clock looks about {abs(best):.2f} s {side}; see --time-offset {best:.2f}",
             at(best, True),
         )
 
