@@ -157,9 +157,7 @@ class Box(Region):
 
     def project(self, points: FloatArray) -> FloatArray:
         """Return points with every coordinate clipped."""
-        # For few points NumPy is as fast, and checks of scenes need not import numba.
-        clip = _project_to_box if points.ndim > 2 else _project_to_box.textbook
-        return clip(points, *self._corners)
+        return _project_to_box(points, *self._corners)
 
     @functools.cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:
