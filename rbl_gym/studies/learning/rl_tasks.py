@@ -102,7 +102,7 @@ def _selection(**arguments: Any) -> RlTask:
 
 def _placement(steps: int, n_anchors: int, log_std_init: float = -1.5, **arguments: Any) -> RlTask:
     # A larger deviation at the start moves anchors apart by chance: their means then stay together.
-    # `uwb_room` has not been tried with this one.
+    # `uwb_room` reaches .895 with this one, and .912 with its own (docs/learning.md).
     rollout = 4 * n_anchors
     return RlTask("RBL/AnchorPlacement-v0", arguments, steps, rollout, log_std_init=log_std_init)
 
