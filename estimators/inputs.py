@@ -109,12 +109,8 @@ def check_epoch(
     """Return an epoch as (ranges, anchors, links); links are None if all were measured.
 
     Ranges behind a False link become 0. With `signed`, ranges may be zero and negative, as with an
-    offset.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, or a range behind a True link is NaN, infinite or not positive.
+    offset. ValueError if shapes do not match, or a range behind a True link is NaN, infinite or not
+    positive.
     """
     if (
         links is None
@@ -242,12 +238,8 @@ def epoch_variance(
     """Return the checked variances of an epoch's ranges.
 
     They come from the noise model of the epoch; None: from the filter's `own`. With `squared` they
-    are those of the squared ranges. Variances that no link uses are 1.
-
-    Raises
-    ------
-    ValueError
-        If the argument is not a noise model of ranges, or does not match these ranges.
+    are those of the squared ranges. Variances that no link uses are 1. ValueError if the argument
+    is not a noise model of ranges, or does not match these ranges.
     """
     law = law_of(noise, own)
     try:
@@ -281,10 +273,7 @@ def plain(state: State) -> State:
 def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:
     """Return the checked noise model of an epoch; None gives that of the filter.
 
-    Raises
-    ------
-    ValueError
-        If the argument is not a noise model of ranges.
+    ValueError if the argument is not a noise model of ranges.
     """
     if noise is None:
         return own

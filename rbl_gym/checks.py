@@ -237,10 +237,8 @@ def check_generator(name: str, rng: Any) -> np.random.Generator:
 def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
     """Return `links` as a boolean mask that broadcasts against ranges of `shape`; None for None.
 
-    Raises
-    ------
-    ValueError
-        If the mask holds other values than 0 and 1, or does not end in the (M, N) of the ranges.
+    ValueError if the mask holds other values than 0 and 1, or does not end in the (M, N) of the
+    ranges.
     """
     if links is None:
         return None

@@ -27,11 +27,7 @@ from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.directed import directed, undirected
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
-from rbl_gym.estimators.inputs import (
-    check_batches,
-    check_one_process,
-    plain,
-)
+from rbl_gym.estimators.inputs import check_batches, check_one_process, plain
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging

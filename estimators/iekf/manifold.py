@@ -28,10 +28,7 @@ from rbl_gym.estimators.costs.map_problem import PoseState, map_problem
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, predict_pose, update_pose
-from rbl_gym.estimators.iekf.robust_update import (
-    HUBER,
-    check_robust,
-)
+from rbl_gym.estimators.iekf.robust_update import HUBER, check_robust
 from rbl_gym.estimators.iekf.vague_start import (
     VAGUE_ROTATION_VARIANCE,
     global_start,
@@ -181,14 +178,7 @@ class IteratedEkf:
             weights = self.weighed(*epoch, PoseState(*start, state.covariance))[1]
         return as_state(
             *update_pose(
-                *state,
-                ranges,
-                weights,
-                WEIGHTS,
-                anchors,
-                self.tags,
-                *start,
-                self.options,
+                *state, ranges, weights, WEIGHTS, anchors, self.tags, *start, self.options
             )[:3]
         )
 

@@ -244,12 +244,8 @@ ENGINES = ("auto", "batched", "filterpy")
 def engine_for(name: str, **arrays: tuple[int, ...]) -> type[Batched] | type[FilterPy]:
     """Return the engine of a step, from its name and the leading axes of all arguments.
 
-    ``"auto"``: filterpy if no argument has leading axes, batched otherwise.
-
-    Raises
-    ------
-    ValueError
-        For filterpy, if an argument has leading axes.
+    ``"auto"``: filterpy if no argument has leading axes, batched otherwise. ValueError for
+    filterpy, if an argument has leading axes.
     """
     if name == "batched":
         return Batched

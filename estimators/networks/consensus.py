@@ -75,10 +75,7 @@ def ring_least_squares(y: ArrayLike) -> FloatArray:
 def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
     """Return the smallest nonzero and the largest eigenvalue of ``F = C C^T``; 1, 1 without cycles.
 
-    Raises
-    ------
-    ValueError
-        If there are more than 1500 dependent cycles over more than 1500 edges.
+    ValueError if there are more than 1500 dependent cycles over more than 1500 edges.
     """
     if C.shape[0] == 0:
         return 1.0, 1.0

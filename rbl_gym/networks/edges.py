@@ -15,12 +15,8 @@ def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray
     """Return `edges` as (m, 2) indices of two different nodes each; `name` is for the message.
 
     An edge may occur twice, in either direction, if it was measured twice. An empty sequence means
-    no edges.
-
-    Raises
-    ------
-    ValueError
-        If they are not pairs of integers in [0, n_nodes), or an edge joins a node to itself.
+    no edges. ValueError if they are not pairs of integers in [0, n_nodes), or an edge joins a node
+    to itself.
     """
     n_nodes = check_count("n_nodes", n_nodes, most=MOST_NODES)
     try:

@@ -47,12 +47,8 @@ def check_connected(
 ) -> IntArray:
     """Return checked `edges` of a connected graph.
 
-    `ids` (n,) are the names of the nodes in the message; None: 0 to n - 1.
-
-    Raises
-    ------
-    ValueError
-        If the graph has several components; the message names them.
+    `ids` (n,) are the names of the nodes in the message; None: 0 to n - 1. ValueError if the graph
+    has several components; the message names them.
     """
     edges = check_edges(edges, n_nodes)
     label = components(edges, n_nodes)
@@ -172,11 +168,8 @@ def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_m
 def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: int) -> sp.csr_matrix:
     """Return a checked user-defined cycle matrix (q, m); its rows may be linearly dependent.
 
-    Raises
-    ------
-    ValueError
-        If it has another number of columns, or a row is not a closed walk that uses each edge
-        once.
+    ValueError if it has another number of columns, or a row is not a closed walk that uses each
+    edge once.
     """
     C = sp.csr_matrix(cycles, dtype=np.float64, copy=True)
     if C.shape[1] != len(edges):

@@ -178,10 +178,7 @@ def _explored(
     envs.venv.seed(seed * SEED_STRIDE)
     curve, cpu = _Curve(advance), time.process_time()
     model.learn(steps, callback=curve.callback())
-    figures = {
-        "env_share": envs.seconds / (time.process_time() - cpu),
-        "curve": curve.points,
-    }
+    figures = {"env_share": envs.seconds / (time.process_time() - cpu), "curve": curve.points}
     policy = policy_of(model)
     return lambda meta: policy._replace(meta=meta), figures
 

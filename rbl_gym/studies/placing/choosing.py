@@ -147,11 +147,7 @@ def improved(
 
 
 def _around(
-    problem: Problem,
-    rng: np.random.Generator,
-    anchors: FloatArray,
-    reach: float | None,
-    count: int,
+    problem: Problem, rng: np.random.Generator, anchors: FloatArray, reach: float | None, count: int
 ) -> FloatArray:
     """Return candidates everywhere, or mostly within a distance of the anchors."""
     if reach is None:
