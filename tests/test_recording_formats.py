@@ -173,6 +173,7 @@ def test_unit_of_the_times_of_a_truth(tmp_path, unit, scale):
     """Poses may be rare: the unit follows from the length of the log."""
     rows = [f"{scale * t:.0f},{t},0,0" for t in range(30)]
     log = read(tmp_path, many(300), truth="\n".join(["t,x,y,z", *rows]))
+    assert log.truth is not None
     np.testing.assert_allclose(log.truth.times, np.arange(30), atol=1e-9)
     notes = [note for note in log.report.notes if "span about as long as the ranges" in note]
     assert len(notes) == (unit != "s")
@@ -181,6 +182,7 @@ def test_unit_of_the_times_of_a_truth(tmp_path, unit, scale):
     rows = [f"{0.01 * k:.2f},{k},0,0" for k in range(0, 360_000, 1000)]
     rows = [*rows[:1], *(f"{0.01 * k:.2f},{k},0,0" for k in range(1, 500)), *rows[1:]]
     log = read(tmp_path, many(40), truth="\n".join(["t,x,y,z", *rows]))
+    assert log.truth is not None
     assert log.truth.times[-1] == 3590.0
 
 

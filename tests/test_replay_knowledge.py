@@ -71,6 +71,7 @@ def test_an_origin_far_from_the_line_of_the_tags_is_a_warning():
 def test_no_information_is_made_up_about_a_rotation_that_the_ranges_leave_open(tags, filter):
     tags = np.array(tags)
     result = outcome(record(tags), filter=filter, walk_m=0.3, smooth=True)
+    assert result.smoothed is not None
     for track, figures in (
         (result.track, result.figures),
         (result.smoothed.track, result.figures["smoothed"]),

@@ -82,8 +82,11 @@ def test_gaps_of_the_ranges_are_counted():
     assert replay.track_figures(recording, track, None, settings)["gaps"]["count"] == 0
     kept = np.ones(100, dtype=bool)
     kept[20:35] = kept[60:91] = False
-    fewer = replay.Track(*(field[kept] for field in track[:4]))
-    log = recording.part(kept)
+    rotation, translation, covariance = (field[kept] for field in track[1:4])
+    fewer = replay.Track(track.times[kept], rotation, translation, covariance)
+    log = recording._replace(
+        times=recording.times[kept], ranges=recording.ranges[kept], links=recording.links[kept]
+    )
     found = replay.track_figures(log, fewer, None, settings)
     assert found["gaps"] == {
         "count": 2,
