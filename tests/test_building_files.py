@@ -17,7 +17,7 @@ from rbl_gym.geometry import polygons
 from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.regions import Box
 from rbl_gym.measurements.ranging import RangeNoise
-from rbl_gym.placement import building, scene_files
+from rbl_gym.placement import building, criteria, scene_files
 from rbl_gym.placement.file_keys import FORMAT, MATERIALS
 from rbl_gym.placement.file_schema import schema
 from rbl_gym.placement.file_walls import wall_pieces
@@ -558,20 +558,20 @@ def test_what_lies_outside_the_walls_is_named_with_its_distance():
     said = notes_of(changed("zones.1.polygon", wide))
     outer = (13.65 - 12.15) * 4.8 / (13.05 * 4.8)
     assert said == (
-        f"zone 'meeting room' lies outside the walls: {100 * outer:.2g} % of its area, up to 1.5 m "
+        f"Zone 'meeting room' lies outside the walls: {100 * outer:.2g} % of its area, up to 1.5 m "
         "away from them."
     )
     away = [[-9, 2], [-3, 2], [-3, 8], [-9, 8]]
-    assert "zone 'meeting room' lies outside the walls: all of it, up to 8.85 m" in notes_of(
+    assert "Zone 'meeting room' lies outside the walls: all of it, up to 8.85 m" in notes_of(
         changed("zones.1.polygon", away)
     )
     assert "anchors.fixed[0] lies outside the walls: up to 0.85 m" in notes_of(
         changed("anchors.fixed", [[25.0, 0.2, 2.6]])
     )
-    assert "mount 'partition 1' lies outside the walls" in notes_of(
+    assert "Mount 'partition 1' lies outside the walls" in notes_of(
         changed("mounts.1.line", [[6, 17], [11, 17]])
     )
-    assert "mount 'ceiling' reaches 2 m above the walls, which end at 3 m" in notes_of(
+    assert "Mount 'ceiling' reaches 2 m above the walls, which end at 3 m" in notes_of(
         changed("mounts.2.height_m", 5.0)
     )
     assert "reaches 0.3 m below the walls, which begin at 0 m" in notes_of(
@@ -582,7 +582,7 @@ def test_what_lies_outside_the_walls_is_named_with_its_distance():
 @needs("shapely")
 def test_the_region_of_the_command_is_checked_too():
     problem = scene_files.of_mapping(OFFICE, region=((1, 1, 0.5), (30, 9, 1.5)))
-    assert problem.notes[0].startswith("the region lies outside the walls: 20 % of its area, up to")
+    assert problem.notes[0].startswith("The region lies outside the walls: 20 % of its area, up to")
 
 
 @needs("shapely")
@@ -607,3 +607,16 @@ def test_the_origin_of_a_drawing_may_be_that_of_a_national_grid_in_millimetres()
     tables["plan"]["zero"] = [1e13, 0]
     with pytest.raises(ValueError, match=re.escape("plan.zero must have numbers of at most 1e+12")):
         scene_files.of_mapping(tables)
+
+
+@needs("shapely")
+def test_a_layout_without_any_sight_of_some_positions_is_judged():
+    tables = copy.deepcopy(OFFICE)
+    for wall in tables["walls"]:
+        wall["material"] = "metal"
+    problem = scene_files.of_mapping(tables)
+    # All four are outside, behind metal.
+    anchors = np.array([[-2.0, -2, 2], [26, -2, 1], [26, 12, 2], [-2, 12, 1.5]])
+    found = criteria.criteria(problem, problem.context, anchors)
+    assert found.conditioning >= 1e12 * (1 - 1e-9)
+    assert all(np.isfinite(value) for value in found)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 pytest.importorskip("shapely", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
 
-from rbl_gym.app import place_answer, place_figures, place_html, place_pdf
+from rbl_gym.app import place_answer, place_figures, place_html, place_pdf, place_svg
 from rbl_gym.app import place_shapes as shapes
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import polygons
@@ -275,6 +275,15 @@ def test_the_page_needs_no_network_and_says_it_all(placed, tmp_path):
     zone = data["maps"][data["level"]][0]
     assert zone["zone"] == "open plan"
     assert np.array(zone["values"]["horizontal"], float).shape[0] >= 8
+
+
+def test_the_plan_of_the_page_has_a_scale(placed):
+    page = place_svg.plan_part(placed)
+    share, length = re.search(r'class="ruler" style="width: ([\d.]+)%">([\d.]+) m<', page).groups()
+    edges = shapes.limits(placed.problem, placed.design.anchors)
+    width = float(np.ptp(edges[:, 0]))
+    assert float(length) / width == pytest.approx(float(share) / 100, abs=1e-4)
+    assert 0.1 <= float(share) / 100 <= 0.25
 
 
 def test_the_report_has_these_pages(placed):

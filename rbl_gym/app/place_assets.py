@@ -1,6 +1,8 @@
 """Style and script of the page of a placement, for the output of `place_svg`."""
 
 STYLE = """
+.plan .ruler { border: 1.5px solid #222; border-top: 0; height: .5em; text-align: center;
+               font-size: .85em; line-height: 2.4; margin: .4em 0 1.4em; }
 .plan { margin: 1em 0; } .plan .stage { position: relative; width: 100%; touch-action: pan-y; }
 .plan svg { position: absolute; inset: 0; width: 100%; height: 100%; overflow: visible; }
 .plan .maps g { display: none; } .plan .maps g.on { display: inline; }

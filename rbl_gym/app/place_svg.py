@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import math
 from typing import Any
 
 import numpy as np
@@ -81,12 +82,25 @@ def plan_part(placed: Placed) -> str:
     return (
         f'<figure class="plan">{_controls(panels, levels)}'
         f'<div class="stage" style="aspect-ratio: {size[0]:.1f} / {size[1]:.1f}">{svg}'
-        f"{_labels(placed, edges)}</div>"
+        f"{_labels(placed, edges)}</div>{_ruler(edges)}"
         f"{''.join(_scale(problem, q, ranges[q.field]) for q in panels)}"
         f'<p class="note">{html.escape(" · ".join(legend_text(problem).split("     ")))}</p>'
         '<p class="readout">Touch the map or an anchor to see its values.</p>'
         f'<script type="application/json">{_data(placed, panels, maps, edges, middle)}</script>'
         "</figure>"
+    )
+
+
+def _ruler(edges: FloatArray) -> str:
+    """Return a bar of a round length below the plan, and the directions of the axes."""
+    width = float(np.ptp(edges[:, 0]))
+    power = 10.0 ** math.floor(math.log10(width / 4))
+    length = power * max(step for step in (1, 2, 5) if step * power <= width / 4)
+    x, y = edges[0]
+    return (
+        f'<div class="ruler" style="width: {100 * length / width:.2f}%">{length:g} m</div>'
+        f'<p class="note">x points to the right, y up; the lower left corner of the plan is at '
+        f"x = {x:.4g} m, y = {y:.4g} m</p>"
     )
 
 

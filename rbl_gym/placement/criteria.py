@@ -78,7 +78,7 @@ def _conditioning(spread: FloatArray) -> FloatArray:
         return np.full(spread.shape[:-3], np.inf)
     singular = np.linalg.svd(spread, compute_uv=False)
     least = np.maximum(singular[..., 2], 1e-12 * singular[..., 0])
-    # Coincident anchors leave only zeros.
+    # Coincident anchors, or anchors without information, leave only zeros.
     ratio = np.divide(singular[..., 0], least, out=np.full(least.shape, 1e12), where=least > 0)
     return np.exp(np.log(ratio).mean(axis=-1))
 
@@ -90,5 +90,7 @@ def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray
     weight = 1 / task.scene.noise.squared_range_variance(np.maximum(distance, 1e-6))
     if in_the_way := task.obstacles_in(context):
         weight = weight * in_the_way.share(anchors, places)[..., None]
-    mean = (weight * anchors[..., None, :, :]).sum(axis=-2) / weight.sum(axis=-2)
+    total = weight.sum(axis=-2)
+    # Without any information, Abar is zero.
+    mean = (weight * anchors[..., None, :, :]).sum(axis=-2) / np.where(total > 0, total, 1.0)
     return np.sqrt(weight) * (anchors[..., None, :, :] - mean[..., None, :])

@@ -38,7 +38,7 @@ def outside(problem: Problem, walls: WallPieces, mounts: list[Mount]) -> tuple[s
     """
     shapely = shapely_module()
     zones = [(_title(zone.name), _shape(shapely, zone.polygon)) for zone in problem.zones]
-    faces = [(f"mount {mount.name!r}", _shape(shapely, mount.shape)) for mount in mounts]
+    faces = [(f"Mount {mount.name!r}", _shape(shapely, mount.shape)) for mount in mounts]
     building = _outline(shapely, walls, [shape for _, shape in zones], [s for _, s in faces])
     if building is None:
         return ()
@@ -48,7 +48,7 @@ def outside(problem: Problem, walls: WallPieces, mounts: list[Mount]) -> tuple[s
     ]
     found += _beside(shapely, building, spots)
     heights = [(_title(zone.name), zone.low_m, zone.high_m) for zone in problem.zones]
-    heights += [(f"mount {mount.name!r}", mount.low_m, mount.high_m) for mount in mounts]
+    heights += [(f"Mount {mount.name!r}", mount.low_m, mount.high_m) for mount in mounts]
     found += _above_or_below(heights, float(walls.low_m.min()), float(walls.high_m.max()))
     if len(found) > _MOST_NOTES:
         more = len(found) - _MOST_NOTES
@@ -57,7 +57,7 @@ def outside(problem: Problem, walls: WallPieces, mounts: list[Mount]) -> tuple[s
 
 
 def _title(name: str) -> str:
-    return "the region" if name == "region" else f"zone {name!r}"
+    return "The region" if name == "region" else f"Zone {name!r}"
 
 
 def _shape(shapely: Any, corners: FloatArray) -> Any:
