@@ -115,7 +115,7 @@ def locate(
           poor.
         * ``"robust"``: for ranges with outliers. ``"robust-late"``: for radio ranges, whose
           outliers are mostly too long. Weights fall with the square of the residual, and are halved
-          for ranges that are too long.
+          for every range longer than predicted.
         * ``"two-step"``: ``cls``, then two Gauss-Newton steps on the raw ranges.
         * ``"ls"``: least squares on the squared ranges without the constraint (static paper, (14)).
         * ``"ls-projected"``: projects the matrix of ``ls`` onto SO(3), then computes the
