@@ -279,7 +279,9 @@ def test_the_page_needs_no_network_and_says_it_all(placed, tmp_path):
 
 def test_the_plan_of_the_page_has_a_scale(placed):
     page = place_svg.plan_part(placed)
-    share, length = re.search(r'class="ruler" style="width: ([\d.]+)%">([\d.]+) m<', page).groups()
+    found = re.search(r'class="ruler" style="width: ([\d.]+)%">([\d.]+) m<', page)
+    assert found is not None
+    share, length = found.groups()
     edges = shapes.limits(placed.problem, placed.design.anchors)
     width = float(np.ptp(edges[:, 0]))
     assert float(length) / width == pytest.approx(float(share) / 100, abs=1e-4)
