@@ -267,8 +267,9 @@ def link_shares(
     """
     gain = scene.gain
     if not in_the_way and not gain:
-        batch = np.broadcast_shapes(anchors.shape[:-2], places.shape[:-2])
-        return np.broadcast_to(1.0, (*batch, places.shape[-2], anchors.shape[-2]))
+        # Several times as fast as np.broadcast_shapes and np.broadcast_to.
+        batch = np.broadcast(anchors[..., :1, 0], places[..., :1, 0]).shape[:-1]
+        return np.ones((*batch, places.shape[-2], anchors.shape[-2]))
     share = in_the_way.share(anchors, places)
     if not gain:
         return share
