@@ -244,7 +244,7 @@ def _subsets(m: int, k: int) -> BoolArray:
     if count > _MOST_SUBSETS:
         raise ValueError(
             f"mode 'subset' allows at most {_MOST_SUBSETS} subsets, but {k} of {m} anchors can be "
-            f"chosen in {count} ways"
+            f"chosen in {count} ways: use mode 'top-k'"
         )
     found = np.zeros((count, m), np.bool_)
     for row, chosen in zip(found, itertools.combinations(range(m), k), strict=True):

@@ -175,7 +175,7 @@ def _check_count(problem: _Problem) -> None:
         raise ValueError(
             f"ranges must be at least as many as the unknowns, got {told} ranges and {unknown} "
             f"unknowns (coordinates of anchors, and {_pose_axes(problem)} for each epoch): each "
-            f"epoch needs more than {_pose_axes(problem)} ranges"
+            f"epoch needs more than {_pose_axes(problem)} ranges, all of the same time"
         )
 
 

@@ -152,7 +152,11 @@ def anchors_from_pairs(pairs: FloatArray, bias_m: float = 0.0, planar: bool = Fa
     d = np.where(d > 0, np.maximum(d - bias_m, 1e-3), 0.0)
     d = shortest_path(d, directed=False)
     if not np.isfinite(d).all():
-        raise ValueError("pairs must connect all anchors, got groups without a range between them")
+        far = np.flatnonzero(~np.isfinite(d[0])).tolist()
+        raise ValueError(
+            "pairs must connect all anchors, but no chain of ranges joins anchor 0 to the anchors "
+            f"{far}"
+        )
     M, D = len(d), 2 if planar else 3
     J = np.eye(M) - 1 / M
     values, vectors = np.linalg.eigh(-0.5 * J @ d**2 @ J)

@@ -91,8 +91,8 @@ def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
     low = sp.linalg.eigsh(F, k=1, sigma=-1e-6, v0=start, return_eigenvectors=False)
     if low[0] <= _ZERO * high[0]:
         raise ValueError(
-            f"more than {_DENSE} cycles must be linearly independent, got {C.shape[0]} "
-            "dependent cycles: use cycles='bfs'"
+            f"at most {_DENSE} cycles may be linearly dependent, got {C.shape[0]}: use "
+            "cycles='bfs', which are independent"
         )
     return float(low[0]), float(high[0])
 
@@ -198,8 +198,8 @@ def _least_norm_columns(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
                 return C.T @ factors.solve(off)
     if min(C.shape) > _DENSE:
         raise ValueError(
-            f"more than {_DENSE} cycles must be linearly independent, got {C.shape[0]} "
-            "dependent cycles: use cycles='bfs'"
+            f"at most {_DENSE} cycles may be linearly dependent, got {C.shape[0]}: use "
+            "cycles='bfs', which are independent"
         )
     return np.linalg.lstsq(C.toarray(), off, rcond=_ZERO)[0]
 
@@ -212,8 +212,8 @@ def _solves(C: sp.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
 def _contradiction(branch: NDArray[Any]) -> str:
     named = np.rint(branch).astype(int).tolist()
     return (
-        "branch: the multiples of 2 pi of dependent cycles contradict each other, got "
-        f"{named!s:.80}; give rint(C psi / 2 pi) of consistent angles psi, or independent cycles"
+        f"branch must be rint(C psi / 2 pi) of some angles psi, got {named!s:.80}, which no angles "
+        "have, as the cycles are dependent; with independent cycles any branch is possible"
     )
 
 

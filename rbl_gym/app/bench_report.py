@@ -130,8 +130,8 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
     rates = [rate for row in conditions.values() if (rate := row.get("trigger_rate")) is not None]
     if any(0 < rate < 1 for rate in rates):
         lines.append(
-            f"{name}: projects after {100 * rates[0]:.0f} % of the updates, in the worst condition "
-            f"after {100 * max(rates):.0f} %"
+            f"{name}: {100 * rates[0]:.0f} % of the updates end with a projection to a rotation, "
+            f"in the worst condition {100 * max(rates):.0f} %"
         )
     return lines
 
@@ -185,7 +185,10 @@ def print_rerun(result: dict[str, Any]) -> None:
         console.print(f"  {name}: {before} then, {after} now")
     if not result["changed"]:
         return
-    headings = "scene", "condition", "filter", "fields", "most: field", "then", "now", "by"
+    headings = (
+        "scene", "condition", "filter", "fields that differ", "most: field", "then", "now",
+        "relative change",
+    )  # fmt: skip
     table = new_table("what differs", headings)
     for row in result["changed"]:
         change = row["relative_change"]

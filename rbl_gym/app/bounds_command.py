@@ -72,7 +72,7 @@ def _print(result: dict[str, Any]) -> None:
     law = result["uncalibrated"]
     console.print(
         "One sigma of all three axes together, root mean square over trials and epochs. Ranges "
-        "alone: of the motion only the distribution of the accelerations is known. Biases of "
+        "alone: only the distribution of the accelerations is known, not the motion. Biases of "
         f"links are constant: {100 * law['std_m']:g} cm for each link and "
         f"{100 * law['common_std_m']:g} cm common to all (one sigma). Biases and anchor positions "
         "are estimated together with the pose."

@@ -137,5 +137,9 @@ def _tags(axes: Any, found: CalibratedLinks) -> None:
         axes.annotate(name, place[:2], xytext=(5, 5), textcoords="offset points", fontsize=8)
     axes.plot(0, 0, "k+", ms=9)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x in the truth's body frame [m]", ylabel="y [m]")
+    axes.set(
+        xlabel="x in the truth's body frame [m]",
+        ylabel="y [m]",
+        title="tags, 2 standard deviations; +: origin",
+    )
     axes.grid(True)

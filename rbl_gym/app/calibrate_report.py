@@ -114,8 +114,8 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
     text = f"Noise of a range: {noise['std_m']:.3f} m (median of the links)"
     if noise["slow_time_s"]:
         text += (
-            f", {100 * noise['slow_share']:.0f} % of its variance slow, over "
-            f"{noise['slow_time_s']:.2g} s"
+            f", {100 * noise['slow_share']:.0f} % of its variance correlated in time (over "
+            f"{noise['slow_time_s']:.2g} s)"
         )
     said.append(
         f"{text}; {100 * noise['beyond_3_std']:.1f} % of the ranges are off by more than three "

@@ -95,7 +95,7 @@ def consistency_parts(replayed: Replayed) -> list[str]:
     causes = [
         [cause["text"], cause["nis_per_dof"], 100 * cause["mended"]] for cause in found["causes"]
     ]
-    headings = ["likely cause", "NIS per dof without it", "of the excess explained (%)"]
+    headings = ["likely cause", "NIS per dof without it", "share of the excess NIS explained (%)"]
     residuals = found["residuals"]
     tuned = replayed.figures.get("tuned")
     parts = [

@@ -50,7 +50,7 @@ def _successes(ax: Any, label: str, data: dict[str, Any], table_1: dict[str, Any
             ax.plot(at, table_1[name]["success_percent"], "D", mfc="w", mec="k", ms=4)
     ax.plot([], [], "k_", label="error of t < 0.5 m")
     if label == _PAPERS:
-        ax.plot([], [], "D", mfc="w", mec="k", ms=4, label="Table 1")
+        ax.plot([], [], "D", mfc="w", mec="k", ms=4, label="Table 1 of the paper")
     ax.set_xticks(places, [f"{sigma:g}" for sigma in data["sigma_deg"]])
     ax.set_title(f"{label}: successes")
     ax.set(ylabel="near the truth [%]", ylim=(0, 122), yticks=range(0, 101, 20))
@@ -66,7 +66,7 @@ def print_doa2019(result: dict[str, Any]) -> None:
             f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials",
             ["noise (deg)", "method"],
             ["R RMSE", "R / bound", "t RMSE (m)", "t / bound", "near truth", "t < 0.5 m",
-             "converged", "iterations", "us / trial", "x NIA"],
+             "converged", "iterations", "us / trial", "time / NIA"],
         )  # fmt: skip
         for k, sigma in enumerate(data["sigma_deg"]):
             for name, method in data["methods"].items():
@@ -90,8 +90,8 @@ def print_doa2019(result: dict[str, Any]) -> None:
         out.print(table)
     out.print(
         "RMSE and ratios are of the trials near the truth: both errors within 6 times the "
-        "bound.\nThe paper says neither what a success is nor how its PSO and PSA were set; "
-        "both\ndefinitions here, near the truth and an error of t below 0.5 m, are ours. At 1 "
+        "bound.\nThe paper says neither what a success is nor how its PSO and PSA were set. Here "
+        "a\nsuccess is a trial near the truth, or one with an error of t below 0.5 m. At 1 "
         "degree\nthe bound of t itself is 0.41 m for R = I. Iterations: median and largest of "
         "the trials\nthat converged."
     )
@@ -100,10 +100,10 @@ def print_doa2019(result: dict[str, Any]) -> None:
 def _print_table_1(out: Any, result: dict[str, Any]) -> None:
     data = result["settings"][_PAPERS]
     headings = (
-        "noise (deg)", "method", "paper: success", "ours: near truth", "ours: t < 0.5 m",
-        "paper: time (s)", "ours: time (s)", "paper: x NIA", "ours: x NIA",
+        "noise (deg)", "method", "paper: success", "here: near truth", "here: t < 0.5 m",
+        "paper: time (s)", "here: time (s)", "paper: time / NIA", "here: time / NIA",
     )  # fmt: skip
-    table = new_table(f"Table 1 of the paper beside ours, {_PAPERS}", (), headings)
+    table = new_table(f"Table 1 of the paper, and the same here, {_PAPERS}", (), headings)
     for k, sigma in enumerate(data["sigma_deg"]):
         for name, paper in result["table_1"].items():
             method = data["methods"][name]

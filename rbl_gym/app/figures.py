@@ -148,7 +148,7 @@ def _trajectory(axes: Any, example: Example) -> None:
     axes.set(
         xlabel="x [m]",
         ylabel="y [m]",
-        title=f"one trial: 95 % beliefs and their errors x {_MAGNIFY}",
+        title=f"one trial: 95 % regions and errors, enlarged x {_MAGNIFY}",
     )
     axes.legend(loc="upper left")
 

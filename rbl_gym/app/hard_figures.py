@@ -37,7 +37,7 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                 color=_COLOURS[label],
             )
         axis.axhline(1.0, color="k", lw=0.8)
-        axis.set(yscale="log", ylabel="translation RMSE / clean bound")
+        axis.set(yscale="log", ylabel="translation RMSE / bound of all links")
         axis.set_title(name, fontsize="large")
         axis.set_xticks(
             range(len(conditions)), [label.replace(", ", ",\n") for label in conditions]
@@ -56,8 +56,8 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                     color=_COLOURS[label],
                     ms=4,
                 )
-        axis.set(xlabel="epochs later", ylabel="trials recovered [%]", ylim=(-3, 103))
-        axis.set_title(f"{name}: 180 degrees, 10 m off")
+        axis.set(xlabel="epochs after the start", ylabel="trials recovered [%]", ylim=(-3, 103))
+        axis.set_title(f"{name}: start 180 deg, 10 m off")
     handles = axes[-1].get_legend_handles_labels()
     lower.legend(*handles, fontsize=9, loc="outside lower center", ncols=6)
     return figure
@@ -68,8 +68,8 @@ def print_hard(result: dict[str, Any]) -> None:
     console = new_console()
     for name, conditions in result["links"].items():
         headings = (
-            "rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)", "lost last",
-            "ever", "largest (m)", "us / step",
+            "rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)", "lost at the end",
+            "lost ever", "largest (m)", "us / step",
         )  # fmt: skip
         title = f"{name}, {result['trials']} trials"
         table = new_table(title, ["links", "filter"], headings, whole=2)
@@ -101,8 +101,7 @@ def print_hard(result: dict[str, Any]) -> None:
         table.add_section()
     console.print(table)
     console.print(
-        "clean, good: posterior Cramer-Rao bounds with all links on straight paths, and with "
-        "the\nstraight links that were measured. Lost, at the last epoch or ever: the squared "
-        "error\nnormalised by the bound's covariance is above 100 (its mean is 6); recovered: "
-        "below it."
+        "clean: the posterior Cramer-Rao bound if all links had straight paths.\ngood: the bound "
+        "of the links that were measured over straight paths.\nLost: the squared error, normalised "
+        "by the bound's covariance, is above 100 (its mean\nis 6). Recovered: it is below 100."
     )

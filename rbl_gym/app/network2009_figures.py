@@ -86,14 +86,14 @@ def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
     """Draw Fig. 4."""
     rows = result["accuracy"]
     edges = [row["edges"] for row in rows]
-    ax.plot(edges, [row["mse"]["measured"] for row in rows], "k--x", ms=4, label="y")
-    ax.plot(edges, [row["mse"]["consensus"] for row in rows], "k-o", ms=4, label="psi")
+    ax.plot(edges, [row["mse"]["measured"] for row in rows], "k--x", ms=4, label="y, measured")
+    ax.plot(edges, [row["mse"]["consensus"] for row in rows], "k-o", ms=4, label="psi, estimated")
     ax.plot(
         edges,
         [row["bound"] for row in rows],
         color="#2e86ab",
         lw=0.8,
-        label="2 sigma^2 (n - 1) / m",
+        label="bound, 2 sigma^2 (n - 1) / m",
     )
     ax.set(xlabel="number of edges", ylabel="mean square error [rad^2]", ylim=(0, None))
     ax.set_title(f"Fig. 4: sigma^2 = {result['variance'][0]:g}, {result['trials']} trials")
@@ -139,7 +139,7 @@ def _distance(ax: Axes, result: dict[str, Any]) -> None:
         ax.semilogy(distance, color=_COLOURS[basis], label=basis)
         ax.semilogy(history["printed_distance"], color=_COLOURS[basis], ls=":", lw=2)
     ax.set(xlabel="iteration", ylabel="distance from the limit [rad]", ylim=(1e-13, None))
-    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: as Theorem 19 prints")
+    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: predicted by Theorem 19")
     ax.legend()
 
 
@@ -157,7 +157,7 @@ def _factors(ax: Axes, convergence: dict[str, Any]) -> None:
         ax.plot(places, [table[rule]["printed_factor_squared"] for rule in rules], "k_", ms=10)
     ax.set_xticks(range(len(rules)), rules)
     ax.set(xlabel="rule for kappa", ylabel="factor of the squared error", ylim=(0.4, 1.12))
-    ax.set_title("true (bars), (1 - kappa)^2 (dashes), means")
+    ax.set_title("bars: true factor, dashes: (1 - kappa)^2; means")
     ax.legend(ncols=3, loc="upper center")
 
 
@@ -181,8 +181,8 @@ def print_network2009(result: dict[str, Any]) -> None:
         out.print(f"kappa, {name}: {slopes}")
     out.print("Section IV-E: the trace's kappa is O(1 / n^3) at worst, O(1 / n) in triangulations.")
     headings = (
-        "cycles", "kappa", "steps", "lambda", "measured", "true", "true^2", "(1 - kappa)^2",
-        "kappa <= Theorem 19's", "factor holds",
+        "cycles", "kappa", "steps", "lambda", "measured factor", "true factor", "squared",
+        "(1 - kappa)^2", "kappa <= Theorem 19's", "(1 - kappa)^2 holds",
     )  # fmt: skip
     table = new_table(f"convergence, {network2009.EXAMPLE_LOOPS} loops", (), headings)
     for basis, rules in result["convergence"].items():

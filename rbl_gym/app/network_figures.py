@@ -53,8 +53,8 @@ def print_network(result: dict[str, Any]) -> None:
     left_out = f"; {without} edges without information of theta are left out" if without else ""
     out.print(f"weights: {result['weights']}{left_out}")
     out.print(
-        f"cost {result['cost']:.10g}, sum of weight x residual^2 (along a tree: "
-        f"{result['tree_cost']:.4g})"
+        f"cost {result['cost']:.10g}, sum of weight x residual^2 (orientations summed along a "
+        f"spanning tree: {result['tree_cost']:.4g})"
     )
     out.print(
         f"residuals {result['residual_rms_deg']:.3f} deg RMS "

@@ -84,14 +84,14 @@ def _way_out(result: dict[str, Any]) -> str:
     move = result["out_of_plane"]
     if move is None:
         return (
-            "No exchange of one anchor makes the mirror image differ by 5 standard deviations at "
-            "95 % of the positions: move more than one out of the plane, or allow mounts at "
-            "another height."
+            "It is not enough to move one anchor to another mount: at more than 5 % of the "
+            "positions the mirror image then still differs by less than 5 standard deviations. "
+            "Move more than one out of the plane, or allow mounts at another height."
         )
     where = ", ".join(f"{move[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
     return (
-        f"Anchor {move['anchor']} moved to ({where}), {move['mount']}, removes the mirror image; b "
-        f"is then {digits(move['ratio'])} times as large."
+        f"Anchor {move['anchor']} moved to ({where}), {move['mount']}, removes the mirror image; "
+        f"the tag error b is then {digits(move['ratio'])} times as large."
     )
 
 
@@ -116,9 +116,9 @@ def _contradictions(result: dict[str, Any]) -> list[str]:
         return []
     cause = " Probable cause: the mirror image behind the plane of the anchors."
     return [
-        "The verdict is that of the prediction: of standard deviations, not of single errors. The "
-        f"check does not confirm the prediction: {', '.join(parts)}; see the table 'checked by "
-        f"Monte Carlo'.{cause if any_lost and result['coplanar'] else ''}"
+        "The check by Monte Carlo does not confirm the prediction, on which the verdict is based: "
+        f"{', '.join(parts)}; see the table 'checked by Monte Carlo'."
+        f"{cause if any_lost and result['coplanar'] else ''}"
     ]
 
 

@@ -98,9 +98,9 @@ def notes(result: dict[str, Any]) -> list[str]:
                 f"{name}: {100 * (1 - figures['found']):.3g} % of the bodies are not found. For "
                 "the others the RMSE of the position is "
                 + _figure(figures.get("position_rmse_found_m"), 4)
-                + " m, which is the predicted one times "
+                + " m, "
                 + _figure(figures.get("position_ratio_found"), 3)
-                + "."
+                + " times the predicted one."
             )
     if result["obstacles"]:
         found.append(
@@ -122,7 +122,7 @@ def _zones(result: dict[str, Any]) -> Rows:
         )
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
-        "position median (m)", "p95", "heading median (deg)", "p95",
+        "horizontal median (m)", "p95", "heading median (deg)", "p95",
     ]  # fmt: skip
     if any(row[-1] is not None for row in rows):
         return Rows(title(result), [*headings, "worst without"], [_texts(row) for row in rows])
@@ -181,7 +181,7 @@ def fewest_rows(fewest: dict[str, Any]) -> Iterator[Rows]:
         rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *values, factor])
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
-        "would pass: position (m)", "height (m)", "heading (deg)", "all times",
+        "would pass: horizontal (m)", "height (m)", "heading (deg)", "or all limits x",
     ]  # fmt: skip
     yield Rows(f"with one anchor fewer, {less['n_anchors']}", headings, rows)
 
@@ -218,7 +218,7 @@ def _without(result: dict[str, Any]) -> Rows:
                 *shares,
             ]
         )
-    headings = ["without", "b (m)", "b / with all", "position RMS (m)", "heading RMS (deg)"]
+    headings = ["without", "b (m)", "b / with all", "horizontal RMS (m)", "heading RMS (deg)"]
     return Rows("what each anchor is for", [*headings, *(f"within {n}" for n in asking)], rows)
 
 
@@ -237,10 +237,10 @@ def _next(result: dict[str, Any]) -> Rows:
             ]
         )
     where = ", ".join(f"{more[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
-    change = f"b changes by a factor of {more['ratio']:.3f}"
+    change = f"b is then {more['ratio']:.3f} times as large"
     title = f"one more anchor would help most at ({where}), {more['mount']}: {change}"
     headings = [
-        "zone", "verdict", "within now", "then", "position RMS (m) now", "then",
+        "zone", "verdict", "within now", "then", "horizontal RMS (m) now", "then",
         "heading RMS (deg) now", "then",
     ]  # fmt: skip
     return Rows(title, headings, rows)
@@ -270,7 +270,7 @@ def _worst(result: dict[str, Any]) -> Rows:
         for zone in result["zones"]
         for place in zone["worst_places"]
     ]
-    headings = ["zone", "x (m)", "y (m)", "z (m)", "position (m)", "height (m)", "heading (deg)"]
+    headings = ["zone", "x (m)", "y (m)", "z (m)", "horizontal (m)", "height (m)", "heading (deg)"]
     return Rows("worst places", headings, rows)
 
 
@@ -341,7 +341,7 @@ def _check(check: dict[str, Any]) -> Rows:
         "filter", "found", "agrees", "position RMSE (m)", "p95", "bound", "ratio",
         "rotation RMSE (deg)", "p95", "bound", "ratio", "NEES",
     ]  # fmt: skip
-    return Rows(f"checked by Monte Carlo, all of {check['trials']} bodies", headings, rows)
+    return Rows(f"checked by Monte Carlo with {check['trials']} bodies", headings, rows)
 
 
 def _check_zones(check: dict[str, Any]) -> list[dict[str, Any]]:

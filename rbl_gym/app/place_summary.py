@@ -69,7 +69,7 @@ def next_anchor(result: dict[str, Any]) -> str:
     """Return where one more anchor would help most, in a sentence."""
     more = result["next_anchor"]
     where = ", ".join(f"{more[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
-    changes = [f"b times {more['ratio']:.3f}"]
+    changes = [f"b is then {more['ratio']:.3f} times as large"]
     for now, then in zip(more["zones_now"], more["zones"], strict=True):
         if "share" in now:
             changes.append(
@@ -82,7 +82,7 @@ def _zones(result: dict[str, Any]) -> Rows:
     zones = result["zones"]
     asks = any("share" in row for row in zones)
     heights = any(row.get("required", {}).get("height_m") is not None for row in zones)
-    keys = [("position_m", "position p95 (m)"), ("heading_deg", "heading p95 (deg)")]
+    keys = [("position_m", "horizontal p95 (m)"), ("heading_deg", "heading p95 (deg)")]
     if heights:
         keys.insert(1, ("height_m", "height p95 (m)"))
     rows = []
@@ -128,4 +128,4 @@ def _check(check: dict[str, Any]) -> Rows:
     headings = [
         "filter", "found", "agrees", "position RMSE / bound", "rotation RMSE / bound", "NEES",
     ]  # fmt: skip
-    return Rows(f"checked by Monte Carlo, all of {check['trials']} bodies", headings, rows)
+    return Rows(f"checked by Monte Carlo with {check['trials']} bodies", headings, rows)

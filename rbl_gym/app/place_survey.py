@@ -13,7 +13,7 @@ def survey_table(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]
     for row in result["survey"]:
         figures = (("position_m", 4), ("rotation_deg", 3), ("score_m", 4))
         shares = [f"{100 * row['within'][name]:.1f} %" for name in asking]
-        rows.append([row["known"], *(digits(row[key], n) for key, n in figures), *shares])
-    headings = ["known", "position RMS (m)", "orientation RMS (deg)", "b (m)"]
+        rows.append([row["unknown"], *(digits(row[key], n) for key, n in figures), *shares])
+    headings = ["unknown", "position RMS (m)", "orientation RMS (deg)", "b (m)"]
     headings += [f"within {name}" for name in asking]
-    return "one epoch, by the knowledge of anchors and links", headings, rows
+    return "one epoch, with errors of the survey or of the links", headings, rows

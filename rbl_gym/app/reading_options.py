@@ -86,8 +86,8 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
     reading.add_argument(
         "--offset",
         choices=OFFSETS,
-        help="ranges are pseudo-ranges with an unknown offset common to each tag, to each anchor "
-        "or to the whole epoch; they may be zero or negative",
+        help="ranges are pseudo-ranges. At each epoch they have one unknown offset for each tag, "
+        "one for each anchor, or one for all; they may be zero or negative",
     )
     reading.add_argument(
         "--wheelbase-m",

@@ -23,7 +23,8 @@ CAMSAP_COLUMNS = (
 # Our column alone, if a source has neither a table nor a claim in words.
 _NO_NUMBERS = {
     "icassp2013": "The paper prints no numbers. Its Figs 2 and 3 show the errors of angle\n"
-    "and translation against the reference range; their parts (b) are the settings with 1 mm. "
+    "and translation against the reference range; their parts (b) are the settings with 1 mm,\n"
+    "the standard deviation of the tag positions. fixed: one draw of the anchors for all trials.\n"
     "CLS and CTLS have the same solution (Lemma 2).",
     "slides2013": "The slides print no numbers and no parameters. The parameters are those of the\n"
     "two papers.",
@@ -56,9 +57,10 @@ def print_camsap2013(result: dict[str, Any]) -> None:
     deviation = 100 / (6 * result["trials"]) ** 0.5
     console.print(
         f"Assumed, as the paper does not print it: {', '.join(result['assumed'])}.\nRatios are to "
-        "the posterior Cramer-Rao bound, averaged over the steps; reward = -log b.\nKF and ET-KF "
-        "are scored by their raw matrix, as in the paper. One standard deviation of\nan RMSE is "
-        f"about {deviation:.1f} %: with few trials a claim can fail by chance."
+        "the posterior Cramer-Rao bound, averaged over the steps; reward = -log b, b the\n"
+        "expected RMS error of the tags in metres. KF and ET-KF are scored by their raw matrix,\n"
+        f"as in the paper. One standard deviation of an RMSE is about {deviation:.1f} %: with few\n"
+        "trials a claim can fail by chance."
     )
 
 

@@ -62,8 +62,8 @@ def add_inertial(group: Any) -> None:
         ),
         (
             "recorded-share",
-            "share of the range deviations in the log that is white noise, default 0.5; the "
-            "rest is constant biases",
+            "share of the standard deviations of the ranges in the log (column std) that is "
+            "white noise, default 0.5; the filter estimates the rest as biases",
         ),
     ):
         group.add_argument(f"--{name}", type=float, metavar="X", help=text)

@@ -275,7 +275,8 @@ def frame_covariance(
     if len(values) and values[0] <= 1e-12 * values[-1]:
         missing = int((values <= 1e-12 * values[-1]).sum())
         raise ValueError(
-            f"edges must determine all frames, but {missing} of their unknowns remain free"
+            f"edges must determine all frames, but {missing} of their unknowns remain free: add "
+            "edges"
         )
     factor = basis @ vectors / np.sqrt(values)
     return factor @ factor.T

@@ -151,8 +151,8 @@ def _csv_rows(path: str) -> _Rows:
     extra += list(_INFORMATION) if set(_INFORMATION) & set(names) else []
     if sorted(names) != sorted([*wanted, *extra]):
         raise ValueError(
-            f"{path}, line {number}: columns must be i, j and dtheta (or y; or a and b), and "
-            f"optionally dx, dy and I11 to I33; got {', '.join(names)!r:.120}"
+            f"{path}, line {number}: columns must be i, j and dtheta (or in its place y, or "
+            f"both a and b), and optionally dx, dy and I11 to I33; got {', '.join(names)!r:.120}"
         )
     order = [names.index(name) for name in ("i", "j", *angle, *extra)]
     others = (*angle, *extra)

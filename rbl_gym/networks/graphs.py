@@ -288,8 +288,8 @@ def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
                     walks.append(list(zip(nodes, [*rows, row], strict=True)))
                     if len(walks) > _MOST_CYCLES:
                         raise ValueError(
-                            f"a graph must have at most {_MOST_CYCLES:,} cycles to list all of "
-                            "them, this one has more"
+                            f"cycles 'all' needs a graph with at most {_MOST_CYCLES:,} cycles, "
+                            "this one has more: use cycles 'bfs'"
                         )
                 elif free >> other & 1 and comes_back(other, start, free ^ 1 << other):
                     free ^= 1 << other

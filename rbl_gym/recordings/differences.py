@@ -131,7 +131,8 @@ def check_lengths(
     too_long = there & (high - low > 1.5 * extent + _NOISE_M)
     if too_long.sum() > _MOST_TOO_LONG * max(there.sum(), 1):
         raise ValueError(
-            f"{path}: units look inconsistent, ranges with a common offset differ by "
-            f"{np.median((high - low)[too_long]):.4g} m, but the distances between their points "
-            f"are at most {extent.max():.4g} m (wrong unit? wrong kind of offset?)"
+            f"{path}: units look inconsistent, ranges of one {'anchor' if axis == -1 else 'tag'} "
+            f"differ by {np.median((high - low)[too_long]):.4g} m (median), but the "
+            f"{'tags' if axis == -1 else 'anchors'} are only {extent.max():.4g} m apart: are they "
+            f"in the unit of the ranges? is the offset really one for each {offset}?"
         )

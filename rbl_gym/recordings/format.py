@@ -146,8 +146,8 @@ class Format:
                 file = key.partition(".")[0] if "." in key else "ranges"
                 if file not in FILES or not value:
                     raise ValueError(
-                        f"{name} must map a quantity, or FILE.quantity with FILE one of "
-                        f"{', '.join(FILES)}, to a name; got {key}={value}"
+                        f"{name} must have keys QUANTITY or FILE.QUANTITY, with FILE one of "
+                        f"{', '.join(FILES)}, and names as values; got {key}={value}"
                     )
 
     def of(self, file: str) -> Source:

@@ -224,7 +224,7 @@ class Scene:
             if moved.max() > 1e-6:
                 raise ValueError(
                     f"anchors that move must start in their region, got one {moved.max():g} m "
-                    "outside"
+                    f"outside, anchors[{int(moved.max(axis=1).argmax())}]"
                 )
         reference = getattr(self.noise, "reference_tag", None)
         if reference is not None and not 0 <= reference < len(self.tags):

@@ -331,7 +331,8 @@ def measure_epoch(
         return measured
     if at.offsets is None:
         raise ValueError(
-            "links.offset must be None here: offsets are drawn only in episodes of a scene"
+            f"links.offset must be None for an epoch without offsets, got {scene.links.offset!r}: "
+            "draw the episode from this scene"
         )
     return ranging.with_offsets(measured, scene.links, at.offsets)
 

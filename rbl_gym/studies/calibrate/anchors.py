@@ -311,11 +311,11 @@ def _result(
     if rank < (2 if settings.planar else 3) and known.sum() < 3 and settings.start == "ranges":
         said.append("which of two mirror images the layout is: the tags do not determine it")
     frame = (
-        "the known anchors"
+        "that of the known anchors"
         if known.sum() >= (2 if settings.planar else 3)
-        else "the known anchors, and the mean turn from the table"
+        else "from the known anchors; the turn that they leave open is that of the table"
         if known.any()
-        else "the mean shift and turn from the table are zero"
+        else "that of the table; the mean shift and turn of the anchors against it are zero"
         if settings.start == "table"
         else f"anchor {ids[0][0]} is the origin, anchor {ids[0][1]} lies on the x axis"
     )

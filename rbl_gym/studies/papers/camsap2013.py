@@ -230,7 +230,7 @@ def claims(
     in_angle = np.array([angle[label] / angle["KF"] for label in linear])
     found += [
         _of_paper(
-            f"the same in MAE: {', '.join(linear)} below KF, averaged over the steps",
+            f"mean angle of {', '.join(linear)} below KF's, averaged over the steps",
             in_angle.mean(axis=1).max() < 1,
             in_angle,
         ),
@@ -256,7 +256,7 @@ def _claims_of_et_kf(
             "ET-KF(0.15)'s RMSE below KF's, averaged over the steps", to_kf.mean() < 1, to_kf
         ),
         Claim(
-            f"and at no step above it by more than {_SIGMAS:.0f} standard errors",
+            f"ET-KF(0.15)'s RMSE at no step above KF's by more than {_SIGMAS:.0f} standard errors",
             "paper",
             bool(beyond <= _SIGMAS),
             f"largest excess {beyond:.1f} standard errors",

@@ -38,13 +38,13 @@ def survey_rows(
 
     Returns
     -------
-    Rows of plain numbers: `known` (a name), `anchor_std_m`, `bias_std_m` and `bias_common_m`, root
-    mean squares `position_m`, `rotation_deg` and `score_m`, and for every zone with
+    Rows of plain numbers: `unknown` (a name), `anchor_std_m`, `bias_std_m` and `bias_common_m`,
+    root mean squares `position_m`, `rotation_deg` and `score_m`, and for every zone with
     requirements the share of its positions `within`, by name.
     """
-    cases: list[tuple[str, float, LinkBias | None]] = [("anchors and links", 0.0, None)]
+    cases: list[tuple[str, float, LinkBias | None]] = [("only the pose", 0.0, None)]
     cases += [(f"anchors to {100 * std:g} cm", std, None) for std in SURVEYS_M]
-    cases += [("anchors, but not the links", 0.0, UNCALIBRATED)]
+    cases += [("links not calibrated", 0.0, UNCALIBRATED)]
     rows = []
     for name, std, bias in cases:
         found = [
@@ -60,7 +60,7 @@ def survey_rows(
         }
         rows.append(
             {
-                "known": name,
+                "unknown": name,
                 "anchor_std_m": std,
                 "bias_std_m": 0.0 if bias is None else bias.std_m,
                 "bias_common_m": 0.0 if bias is None else bias.common_std_m,

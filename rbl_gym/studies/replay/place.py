@@ -141,9 +141,8 @@ def height_offset(recording: Recording, settings: Settings) -> float:
     told = (known.height_offset_m, known.height_m, known.start)
     if known.planar and all(x is None for x in told) and np.ptp(heights) > _PLANE_M:
         raise ValueError(
-            "height_m (height of the body) or height_offset_m (depth of the tags below the "
-            "anchors, difference of the mean heights) must be given: planar ranges do not "
-            f"determine the height, and the anchors are at {heights.min():g} to "
-            f"{heights.max():g} m"
+            "planar needs height_m (height of the body) or height_offset_m (depth of the tags "
+            "below the anchors, difference of the mean heights), as the anchors are at heights "
+            f"of {heights.min():g} to {heights.max():g} m"
         )
     return settings.knowledge.height_offset_m or 0.0

@@ -339,7 +339,10 @@ class Settings:
         )
         if "robust" in fields:
             if "robust" in parse_filter(fields.get("filter", ""))[1]:
-                raise ValueError(f"robust is given twice, got {fields!r:.200}")
+                raise ValueError(
+                    "robust is given twice, in filter and as robust: leave out one, got "
+                    f"{fields!r:.200}"
+                )
             options |= {"robust": fields["robust"]} if "robust" in options else {}
         fields["filter_options"] = tuple(options.items())
         groups = {name: getattr(self, name) for name in vars(self)}

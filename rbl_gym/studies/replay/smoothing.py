@@ -189,13 +189,13 @@ def _backwards(recording: Recording, settings: Settings) -> OdometryLog | None:
 
 def _check_size(recording: Recording, settings: Settings) -> None:
     K, M, N = recording.ranges.shape
-    drifting = settings.smoothing.smooth_bias_std_m > 0
+    name, std = "smooth_bias_std_m", settings.smoothing.smooth_bias_std_m
     if settings.filter == "iekf-imu":
-        drifting = settings.biases.drift_std_m > 0
+        name, std = "drift_std_m", settings.biases.drift_std_m
+    drifting = std > 0
     memory = 5 * 8 * K * (12 + drifting * M * N) ** 2
     if memory > _MOST_MEMORY:
         raise ValueError(
             f"smoothing {K} epochs with drifting biases of {M * N} links would take "
-            f"{memory / 1e9:.0f} GB of memory: set smooth_bias_std_m (of iekf-imu drift_std_m) to "
-            "0, or smooth shorter logs"
+            f"{memory / 1e9:.0f} GB of memory: set {name} to 0, or smooth shorter logs"
         )
