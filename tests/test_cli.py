@@ -340,7 +340,7 @@ def test_planar_among_anchors_at_different_heights_needs_the_tags_height(raw_fil
     said = capsys.readouterr()
     if offset is None:
         assert status == 2
-        assert "and the anchors are at 1 to 1.4 m" in said.err
+        assert "as the anchors are at heights of 1 to 1.4 m" in said.err
     else:
         assert status == 0
         assert json.loads(said.out)["settings"]["height_offset_m"] == float(offset)

@@ -574,7 +574,7 @@ def test_units_of_the_header_that_are_none(tmp_path):
     ("options", "message"),
     [
         ({"columns": {"lidar.x": "x"}}, "one of ranges, anchors, .*; got lidar.x=x"),
-        ({"columns": {"time": ""}}, "columns must map a quantity, .*; got time="),
+        ({"columns": {"time": ""}}, "columns must have keys QUANTITY .*; got time="),
         ({"time_unit": "min"}, r"time_unit must be one of 's', 'ms', .*, got 'min'"),
         ({"where": {"run": "7"}}, r"line 1: no column 'run' to choose rows by, got \['t', "),
         ({"where": {"anchor": "Z"}}, r"line 1: no row has anchor=Z, got \['A', 'B', 'C'\]"),

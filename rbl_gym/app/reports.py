@@ -124,7 +124,7 @@ def print_replay(result: dict[str, Any]) -> None:
 
 def error_rows(result: dict[str, Any], axes: str) -> Iterator[tuple[str, int, list[float]]]:
     """Return label, number of decimals, and RMSE, median and p95 of every known error."""
-    shown = {"position": f"position {axes}", "centre": "tags' centre", "axis": "tags' line"}
+    shown = {"position": f"position {axes}", "centre": "tags' centre", "axis": "line through the tags"}
     for name, unit, places in (
         ("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2), ("centre", "m", 4),
         ("axis", "deg", 2),
@@ -262,7 +262,9 @@ def print_evaluation(result: dict[str, Any]) -> None:
     console.print(table)
     best, best_of = result["best_reference"], result["best_of"]
     what = f", the best of {', '.join(best_of)} in each world" if len(best_of) > 1 else ""
-    console.print(f"normalised: 0 is random, 1 is {best}{what}")
+    scored = all(row["score_m"] is not None for row in result["methods"].values())
+    console.print(f"loss: {'the mean of log b' if scored else 'minus the mean reward'}")
+    console.print(f"normalised: 0 is random, 1 is {best}{what}; 95 %: its confidence interval")
 
 
 def print_transfer(result: dict[str, Any]) -> None:
@@ -273,7 +275,7 @@ def print_transfer(result: dict[str, Any]) -> None:
         table = new_table(
             f"{result['task']}, {name}, {result['worlds']} worlds{each}",
             ["layouts" if each else "policy"],
-            ["score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"],
+            ["score b (m)", "tag RMSE of the filter (m)", "correlation of their logarithms"],
         )
         for label, row in rows.items():
             alike = row["correlation"]
