@@ -124,7 +124,11 @@ def print_replay(result: dict[str, Any]) -> None:
 
 def error_rows(result: dict[str, Any], axes: str) -> Iterator[tuple[str, int, list[float]]]:
     """Return label, number of decimals, and RMSE, median and p95 of every known error."""
-    shown = {"position": f"position {axes}", "centre": "tags' centre", "axis": "line through the tags"}
+    shown = {
+        "position": f"position {axes}",
+        "centre": "tags' centre",
+        "axis": "line through the tags",
+    }
     for name, unit, places in (
         ("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2), ("centre", "m", 4),
         ("axis", "deg", 2),
