@@ -134,8 +134,8 @@ def _add_tuning(group: Any) -> None:
         "--tune",
         action="store_true",
         help="choose --range-std-m and the motion (--walk-..., or --accel-... if the twist is "
-        "estimated) by the likelihood of the first part of the log; without --filter also "
-        "the filter, or iekf-bias with --calibration. The truth is not used",
+        "estimated) by the likelihood of the first part of the log. Without --filter it "
+        "also chooses the filter; with --calibration it takes iekf-bias. The truth is not used",
     )
     _add_numbers(group, (
         ("tune-s", "length of this first part, seconds, default 20; implies --tune"),

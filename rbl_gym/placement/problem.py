@@ -356,8 +356,7 @@ def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
 
 def root_of(square: FloatArray) -> FloatArray:
     """Return scores (...) from their squares; raises ValueError if they are not finite."""
-    # Also false for NaN.
-    if np.count_nonzero(square > 0) < square.size or not all_finite(square):
+    if np.count_nonzero(square > 0) < square.size or not all_finite(square):  # NaN is not > 0
         error = f"got the mean square tag error {square.max():g}"
         raise ValueError(f"information must be positive definite and finite, {error}")
     return np.sqrt(square)
