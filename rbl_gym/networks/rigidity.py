@@ -145,7 +145,7 @@ class Freedom(NamedTuple):
 
 
 def feasible_rotations(u_ij: ArrayLike, u_ji: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return rotations from frame j to frame i consistent with two opposite bearings (Lemma 13).
+    """Return rotations from frame j to frame i that agree with their two bearings (Lemma 13).
 
     They are ``exp(phi [u_ij]x) R_0`` with any phi: the bearings do not determine the rotation about
     the line of sight.
