@@ -36,8 +36,8 @@ def add_bench(commands: Any) -> None:
         type=names,
         metavar="A,B",
         help=f"filters to compare, each {FILTER_HELP}. Default: all filters except iekf-bank, "
-        "iekf-bias, iekf-cv, iekf-imu and iekf-log; also iekf/robust=true, and the filters made "
-        "for each scene",
+        "iekf-bias, iekf-cv, iekf-imu and iekf-log; also iekf/robust=true; in scenes with an "
+        "inertial sensor or survey errors also the filters that use or estimate these",
     )
     bench.add_argument(
         "--scenes",

@@ -49,7 +49,10 @@ def add_convert(commands: Any) -> None:
     )
     for kind, text in _KINDS.items():
         convert.add_argument(
-            f"--{kind}", metavar="KEY=VALUE,...", type=_table, help=f"{text}; none: do not write it"
+            f"--{kind}",
+            metavar="KEY=VALUE,...",
+            type=_table,
+            help=f"{text}. --{kind} none: no file",
         )
     convert.add_argument(
         "--messages",

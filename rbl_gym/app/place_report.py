@@ -86,8 +86,8 @@ def notes(result: dict[str, Any]) -> list[str]:
         f"{math.degrees(criteria['rotation_rad']):.3g} deg, D-optimal "
         f"{criteria['d_optimal_m']:.4g} m, E-optimal {criteria['e_optimal_m']:.4g} m, conditioning "
         + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
-        f"Check: {check['trials']} bodies at random poses, as many in each zone; the EKF starts "
-        f"from a prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m "
+        f"Check: {check['trials']} bodies at random poses, equally many in each zone; the EKF "
+        f"has a prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m "
         "around the truth. RMSE, ratio and NEES (6 if consistent) are of all bodies that have a "
         "pose; found: share of bodies with an error below the limit that a consistent filter "
         "exceeds once in a million.",
@@ -104,7 +104,8 @@ def notes(result: dict[str, Any]) -> list[str]:
             )
     if result["obstacles"]:
         found.append(
-            "'Told': the radio reports which links are blocked, and the filter weighs them less."
+            "'not told': the filter does not know which links are blocked. The others know, "
+            "as some radios report it, and weigh these links less."
         )
     return found
 
