@@ -217,9 +217,10 @@ def measure_in_space(
     apart = positions[..., j, :] - positions[..., i, :]
     length = np.linalg.norm(apart, axis=-1, keepdims=True)
     if not length.all():
-        pair = int(i[k := np.argwhere(length[..., 0] == 0)[0][-1]]), int(j[k])
+        edge = np.argwhere(length[..., 0] == 0)[0][-1]
+        pair = [int(i[edge]), int(j[edge])]
         raise ValueError(
-            f"positions of nodes with an edge must differ, those of nodes {[*pair]} are the same"
+            f"positions of nodes with an edge must differ, those of nodes {pair} are the same"
         )
     toward = np.stack([apart, -apart], axis=-2) / length[..., None]
     observers = np.stack([orientations[..., i, :, :], orientations[..., j, :, :]], axis=-3)
