@@ -259,12 +259,18 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
     return mask
 
 
-def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) -> str:
-    """Return `value` if it is among `choices`, or raise ValueError that lists them."""
+def check_one_of(
+    name: str, value: str, choices: tuple[str, ...] | list[str], advice: str = ""
+) -> str:
+    """Return `value` if it is among `choices`, or raise ValueError that lists them.
+
+    The message ends with the `advice`, a text that says what to do instead.
+    """
     if not isinstance(value, str) or value not in choices:
         near = did_you_mean(value, choices)
         raise ValueError(
             f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r:.80}{near}"
+            f"{advice and '; '}{advice}"
         )
     return value
 

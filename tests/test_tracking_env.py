@@ -302,6 +302,12 @@ def test_bad_reward_is_named(reward):
         TrackingEnv(reward=reward)
 
 
+@pytest.mark.parametrize("name", ["Tracking", "BaseStation"])
+def test_a_function_as_reward_is_sent_to_the_wrapper(name):
+    with pytest.raises(ValueError, match=r"got .*abs.*: EstimatePose\(env, filter, reward=...\)"):
+        gym.make(f"rbl_gym:RBL/{name}-v0", reward=abs)
+
+
 def test_bad_render_mode_is_named():
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         TrackingEnv(render_mode="human")

@@ -21,6 +21,10 @@ from rbl_gym.wrappers.estimate import FilterLike, make_filter, named_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
 
 REWARDS = ("bound", "filter")
+_REWARD_ADVICE = (
+    "for a reward of your own write a gymnasium.Wrapper whose step computes it from info "
+    "(info['anchors'], info['score_m'], info['region'])"
+)
 # Keys of the infos that describe a layout.
 _TOLD = ("region", "racks", "anchors", "rack_mask", "anchor_mask")
 
@@ -255,7 +259,7 @@ def _worlds(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_filtered(reward: str, filter: Any, options: Any) -> bool:
-    if check_one_of("reward", reward, REWARDS) == "filter":
+    if check_one_of("reward", reward, REWARDS, _REWARD_ADVICE) == "filter":
         return True
     if not isinstance(filter, str) or filter != "iekf" or options is not None:
         raise ValueError(

@@ -16,7 +16,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore, FamilyStore
 from rbl_gym.envs.scalar import ScalarEnv
-from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
+from rbl_gym.envs.tracking import REWARD_ADVICE, REWARDS, action_space, observation_space
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import bearing
 from rbl_gym.measurements.ranging import LinkModel
@@ -103,7 +103,7 @@ class BaseStationVectorEnv(BatchEnv):
         self._scene = world(scene) if self.family is None else self.family.corners[0]
         worlds = self.family or self._scene
         self.noise = bearing.AngleNoise(check_number("angle_std_rad", angle_std_rad, low=1e-12))
-        self.reward_mode = check_one_of("reward", reward, REWARDS)
+        self.reward_mode = check_one_of("reward", reward, REWARDS, REWARD_ADVICE)
         shape = (2, len(self._scene.tags))
         of_ranges = observation_space(worlds)
         place = of_ranges["anchors"]

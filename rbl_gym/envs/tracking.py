@@ -20,6 +20,10 @@ from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 
 REWARDS = ("bound", "none")
+REWARD_ADVICE = (
+    "for other rewards, or a function, wrap the environment: EstimatePose(env, filter, reward=...)"
+    ", or VectorEstimatePose, from rbl_gym.wrappers"
+)
 # Bound of the observations of a family, whose scenes have different bounds.
 _FAR = 1e9
 
@@ -266,7 +270,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
 def check_reward(reward: Any, family: SceneFamily | None) -> str:
     """Return the reward; raises ValueError if the worlds have no such bound."""
-    check_one_of("reward", reward, REWARDS)
+    check_one_of("reward", reward, REWARDS, REWARD_ADVICE)
     if reward == "bound" and family is not None and family.is_surveyed:
         raise ValueError(
             "reward must be 'none' if scenes have survey_std_m, as their bounds have different "
