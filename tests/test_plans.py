@@ -376,3 +376,19 @@ def test_the_file_reads_as_the_tables_do(tmp_path):
     assert tomllib.loads(text) == toml_text.plain(tables)
     assert max(map(len, text.splitlines())) <= 100
     assert json.loads(json.dumps(toml_text.plain(tables))) == toml_text.plain(tables)
+
+
+def test_layers_keep_the_use_of_their_name_beside_options():
+    drawing = plan_of(
+        square(0, 0, 9, "Walls"),
+        square(1, 1, 5, "zones"),
+        square(0, 0, 9, "C"),
+        square(1, 1, 1, "D"),
+    )
+    made = layers.building(drawing, uses("mounts C,kind=ceiling"))
+    assert made.used == {"C": ["mounts"], "Walls": ["walls"], "zones": ["zones"]}
+    assert made.said[-1] == "not used: 1 entity on 1 layer (D)"
+    # An option takes the place of the name: that of the kind, and that of the layer.
+    assert layers.building(drawing, uses("walls D")).used == {"D": ["walls"], "zones": ["zones"]}
+    made = layers.building(drawing, uses("obstacles wall*"))
+    assert made.used == {"Walls": ["obstacles"], "zones": ["zones"]}

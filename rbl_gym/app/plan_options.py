@@ -33,8 +33,8 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
         "floor plan",
         "For a drawing (.dxf, .geojson) or a picture (.png, .jpg). Each of the first six options "
         "says what a layer of a drawing is, as LAYER,KEY=VALUE,...; * in LAYER matches any "
-        "letters; each may be given several times. Without them, the names of the layers (walls, "
-        "zones, ...) decide. The keys are listed after the colon.",
+        "letters; each may be given several times. Without the option, layers of that name (walls, "
+        "zones, ...) are used. The keys are listed after the colon.",
     )
     for kind, text in _HELP.items():
         plan.add_argument(f"--{kind}", action="append", default=[], metavar="LAYER", help=text)

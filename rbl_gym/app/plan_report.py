@@ -44,13 +44,6 @@ def print_plan(layers: list[dict[str, Any]], said: list[str]) -> None:
                 _counts(row["unread"]) or "-",
             )
         console.print(table)
-        unused = [row for row in layers if row["entities"] and not row["taken_for"]]
-        if unused:
-            count = sum(sum(row["entities"].values()) for row in unused)
-            names = ", ".join(row["layer"] for row in unused)
-            entities = "entity" if count == 1 else "entities"
-            where = f"{len(unused)} layer{'s' if len(unused) > 1 else ''}"
-            said = [*said, f"not used: {count} {entities} on {where} ({names})"]
     for line in said:
         console.print(line)
 

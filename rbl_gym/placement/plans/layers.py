@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,9 +67,9 @@ def building(
     drawing
         Drawing from `reading.read_drawing`.
     uses
-        Uses of the layers; for several of the same layer and kind, the first counts. If empty,
-        layers are used by their names, which must be in `KINDS`, in upper or lower case, singular
-        or plural.
+        Uses of the layers; for several of the same layer and kind, the first counts. For a kind
+        without a use, the other layers are used by their names: that of the kind, in upper or lower
+        case, singular or plural.
     height_m
         Height of the ceiling above the floor, metres, for walls, obstacles and mounts without their
         own height.
@@ -82,7 +83,7 @@ def building(
     """
     uses = list(uses)
     made = _Maker(drawing, height_m)
-    for use in uses or _by_name(drawing):
+    for use in [*uses, *_by_name(drawing, uses)]:
         layers = [name for name in drawing.layers() if _matches(name, use.layer)]
         if not layers:
             raise ValueError(
@@ -99,6 +100,7 @@ def building(
             "the use of the layers is not given: give --walls LAYER, --obstacles LAYER, --zones "
             "LAYER, --mounts LAYER"
         )
+    made.said += _not_used(drawing, made.used)
     made.complete()
     return Building(made.tables(n_anchors), made.used, made.said)
 
@@ -107,13 +109,29 @@ def _matches(name: str, pattern: str) -> bool:
     return name == pattern or fnmatch.fnmatchcase(name.lower(), pattern.lower())
 
 
-def _by_name(drawing: Drawing) -> list[Use]:
-    """Return uses by layer name: wall, walls, WALLS, zone, ..."""
+def _by_name(drawing: Drawing, uses: list[Use]) -> list[Use]:
+    """Return uses by layer name (wall, walls, WALLS, zone, ...), beside those that are given."""
+    given = {use.kind for use in uses}
     return [
         Use(kind, layer, {})
         for kind in KINDS
         for layer in drawing.layers()
-        if layer.lower() in (kind, kind.removesuffix("s"))
+        if kind not in given
+        and layer.lower() in (kind, kind.removesuffix("s"))
+        and not any(_matches(layer, use.layer) for use in uses)
+    ]
+
+
+def _not_used(drawing: Drawing, used: Iterable[str]) -> list[str]:
+    """Return a note on the layers with shapes that have no use."""
+    counts = Counter(shape.layer for shape in drawing.shapes if shape.layer not in used)
+    if not counts:
+        return []
+    total = counts.total()
+    names = ", ".join(layer for layer in drawing.layers() if layer in counts)
+    return [
+        f"not used: {total} {'entity' if total == 1 else 'entities'} on {len(counts)} "
+        f"layer{'s' if len(counts) > 1 else ''} ({names})"
     ]
 
 
