@@ -66,6 +66,7 @@ FAULTS = {
     "deviation": ("range-std", recording(RANGES), {"range_std_m": 0.03}),
     "two anchors": ("anchors-swapped", recording(RANGES[:, [0, 4, 2, 3, 1, 5, 6]]), {}),
     "two tags": ("tags-swapped", recording(RANGES[..., [3, 1, 2, 0, 4]]), {}),
+    "x and y": ("mirrored", recording(RANGES, ANCHORS[:, [1, 0, 2]]), {}),
     "an anchor": (
         "anchor-moved",
         recording(RANGES, ANCHORS + only(2)[:, :1] * [0.8, -0.5, 0.3]),
@@ -92,6 +93,7 @@ FAULTS = {
 WORDS = {
     "two anchors": "anchors A1 and A4 look swapped",
     "two tags": "tags T0 and T3 look swapped",
+    "x and y": "x and y of the anchors look swapped",
     "all ranges": "all ranges look 0.40 m too long",
     "an anchor's ranges": "the ranges of anchor A3 look 0.5",
     "a tag's ranges": "the ranges of tag T2 look 0.4",
@@ -132,6 +134,22 @@ def test_a_short_log_tells_a_fault_of_settings_and_one_of_files(fault):
     figures = replay.replay_recording(log, SETTINGS.changed(**changed)).figures
     assert [cause["kind"] for cause in figures["consistency"]["causes"]] == [kind]
     assert figures["consistency"]["causes"][0]["mended"] > 0.9
+
+
+@with_kernels
+def test_a_symmetric_body_may_have_two_swapped_tags_or_mirrored_anchors():
+    tags = np.array([[0.4, 0, 0], [-0.3, 0.3, 0.1], [-0.3, -0.3, 0.1]])
+    rng = np.random.default_rng(8)
+    turn = rotations.exp(np.linspace(0, 3, 70)[:, None] * [0, 0, 1.0])
+    place = np.array([5.0, 4, 0]) + np.linspace(-2, 2, 70)[:, None] * [1, 0.5, 0]
+    true = ranging.distances(ANCHORS, ranging.tag_positions(turn, place, tags))
+    ranges = true + 0.1 * rng.standard_normal(true.shape)
+    log = recording(ranges, ANCHORS[:, [1, 0, 2]], tags)
+    settings = SETTINGS.changed(planar=True, height_m=0.0, walk_deg=60.0, walk_m=0.6)
+    (cause,) = replay.replay_recording(log, settings).figures["consistency"]["causes"]
+    assert cause["kind"] in ("mirrored", "tags-swapped")
+    assert "x and y of the anchors look swapped" in cause["text"]
+    assert "; or tags T1 and T2 look swapped" in cause["text"]
 
 
 @with_kernels

@@ -152,8 +152,13 @@ FAULTS = {
     "early": (transformed(late_s=-0.4), r"clock looks about 0.(35|40|45) s behind .*offset -0"),
     "shift": (transformed(shift=(5, -2, 0.3)), r"world frame, turned by \(.*shifted by \(-5\.0"),
     "map": (transformed(shift=(448262, 5411932, 310)), "world frame"),
-    "north-east-down": (transformed((np.pi / 2**0.5, np.pi / 2**0.5, 0)), "world frame"),
-    "turned frame": (transformed((0, 0, 0.6), (1, 2, 0)), "world frame"),
+    "north-east-down": (
+        transformed((np.pi / 2**0.5, np.pi / 2**0.5, 0)),
+        "world frame, .* as if x and y of the anchors .* swapped, or the truth in north-east-down",
+    ),
+    "half turn about x": (transformed((3.1, 0.1, 0)), "as if the layout of the anchors .*mirrored"),
+    "half turn about z": (transformed((0, 0.1, 3.1)), r"world frame, .* m; see --align"),
+    "turned frame": (transformed((0, 0, 0.6), (1, 2, 0)), r"world frame, .* m; see --align"),
     "marker off the body": (transformed(arm=(0.3, 0.1, -0.2)), "body frame.*shifted by"),
     "marker turned": (transformed(body=(0.1, 0, 0.5)), r"body frame, turned by \(-\d\.\d, "),
 }  # fmt: skip

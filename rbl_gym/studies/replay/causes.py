@@ -29,6 +29,9 @@ __all__ = ["Cause", "likely_causes"]
 _RANGES, _FEWEST, _MOST = 6_000, 100, 1_500
 # Shares of the excess that the causes together, and each of them, must remove to be reported.
 _ENOUGH, _WORTH = 0.5, 0.1
+# Two swapped tags of a symmetric body are a reflection, as a mirrored layout is. Both are reported
+# if their log-likelihoods differ by less.
+_REFLECTIONS, _AS_LIKELY = ("mirrored", "anchors-swapped", "tags-swapped"), 5.0
 
 
 class Cause(NamedTuple):
@@ -37,7 +40,7 @@ class Cause(NamedTuple):
     Attributes
     ----------
     kind
-        ``"walk"``, ``"acceleration"``, ``"range-std"``, ``"anchors-swapped"``,
+        ``"walk"``, ``"acceleration"``, ``"range-std"``, ``"mirrored"``, ``"anchors-swapped"``,
         ``"tags-swapped"``, ``"anchor-moved"``, ``"anchor-bias"``, ``"tag-bias"``, ``"link-bias"``,
         ``"common-bias"``, ``"units"``, ``"height"`` or ``"outliers"``.
     text
@@ -98,6 +101,10 @@ def likely_causes(
         likelihood += density * tried.dof.sum(axis=1)
         best = int(np.argmax(likelihood))
         kind, text, mended, *_ = suppositions[best]
+        if kind in _REFLECTIONS:
+            near = likelihood > likelihood[best] - _AS_LIKELY
+            equal = [x for x, y in zip(suppositions, near, strict=True) if y]
+            text = "; or ".join(x.text for x in equal if x.kind in _REFLECTIONS)
         chosen = tried.part(slice(best, best + 1))
         after = max(_excess(mended, chosen), 0.0) / excess
         if left - after < _WORTH or not likelihood[best] > here.log_likelihood[0].sum():

@@ -54,6 +54,10 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
     """Yield the faults that can be tested without previous results."""
     recording, settings = trial
     yield from _of_settings(trial)
+    # A reflection of the tags is the same up to a rigid motion.
+    crossed = recording._replace(anchors=recording.anchors[..., [1, 0, 2]])
+    text = "x and y of the anchors look swapped, or the layout of anchors or tags mirrored"
+    yield Supposition("mirrored", text, _with(trial, crossed))
     for kind, ids, axis in (("anchors", recording.anchor_ids, 1), ("tags", recording.tag_ids, 2)):
         for i, j in itertools.combinations(_most_active(recording, axis), 2):
             text = f"{kind} {ids[i]} and {ids[j]} look swapped"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -25,6 +26,8 @@ _AS_GOOD = 1.5
 # Fewest poses that determine a fault; the tested time shifts (s), then those around the best.
 _FEWEST = 4
 _SHIFTS, _FINE_SHIFTS = np.linspace(-3.0, 3.0, 31), np.linspace(-0.15, 0.15, 7)
+# Angle within which a turn is taken for a half turn, and its axis for horizontal or diagonal.
+_NEAR_RAD = math.radians(15.0)
 _SI = ((1e-3, "milli", "ms"), (1e-6, "micro", "us"), (1e-9, "nano", "ns"))
 
 
@@ -273,7 +276,8 @@ def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
     R = rotations.nearest(turns + trust * np.einsum("k,ki,kj->ij", w, *spread))
     shift = w @ (p - q @ R.T)
     yield (
-        f"a constant offset of the truth's world frame, {_words(R, shift)}; see --align",
+        f"a constant offset of the truth's world frame, {_words(R, shift)}{_mirrored(R)}; "
+        "see --align",
         judged._replace(true_rotation=R @ Q, true_translation=q @ R.T + shift),
     )
     if not judged.has_rotation:
@@ -295,6 +299,21 @@ def _words(rotation: FloatArray, shift: FloatArray) -> str:
         for a, n in ((np.rad2deg(rotations.log(rotation)), 1), (shift, 3))
     )
     return f"turned by ({turn}) deg about x, y, z and shifted by ({place}) m"
+
+
+def _mirrored(rotation: FloatArray) -> str:
+    """Return words on a half turn about a horizontal axis, which a mirrored layout looks like."""
+    vector = rotations.log(rotation)
+    x, y, z = vector / max(float(np.linalg.norm(vector)), 1e-12)
+    if np.linalg.norm(vector) < math.pi - _NEAR_RAD or abs(z) > math.sin(_NEAR_RAD):
+        return ""
+    swapped = abs(math.remainder(math.atan2(y, x) - math.pi / 4, math.pi)) < _NEAR_RAD
+    if swapped:
+        return (
+            ", as if x and y of the anchors (or of the truth) were swapped, or the truth in "
+            "north-east-down"
+        )
+    return ", as if the layout of the anchors (or the truth) were mirrored"
 
 
 def judged_of(
