@@ -106,14 +106,14 @@ def names() -> list[str]:
 
 
 def make(
-    name: str,
+    name: str | Callable[..., Filter],
     *,
     tags: ArrayLike,
     noise: NoiseLaw | AngleNoise,
     process: ProcessNoise,
     **options: Any,
 ) -> Filter:
-    """Make a filter by its name.
+    """Make a filter by its name, or by a factory.
 
     Parameters
     ----------
@@ -121,7 +121,8 @@ def make(
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
         ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the entry-point group
         ``rbl_gym.filters`` of another package; or ``"package.module:factory"``, which is imported.
-        Options may follow it, as in ``"iekf/robust=true"`` (`parse_filter`).
+        Options may follow it, as in ``"iekf/robust=true"`` (`parse_filter`). Or a factory: a class
+        or a function with the arguments `tags`, `noise`, `process` and its own options.
     tags
         (N, 3), positions in the body frame, metres.
     noise
@@ -135,7 +136,8 @@ def make(
     Raises
     ------
     ValueError
-        If the name or an option is unknown or given twice, or an argument is out of range.
+        If the name or an option is unknown or given twice, a factory does not have the three
+        arguments, or an argument is out of range.
     """
     name, options = parse_filter(name, options)
     factory = factory_of(name)
@@ -154,6 +156,12 @@ def make(
     parameters = inspect.signature(factory).parameters
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     laws = ("tags", "noise", "process")
+    missing = [key for key in laws if not (takes_any or key in parameters)]
+    if missing:
+        raise ValueError(
+            f"filter {name!r:.80} must be made by factory(tags=..., noise=..., process=...), but "
+            f"its arguments are ({', '.join(parameters)})"
+        )
     known = [key for key in parameters if key not in laws]
     unknown = [key for key in options if key in laws or not (takes_any or key in known)]
     if unknown:
@@ -164,14 +172,14 @@ def make(
     return factory(tags=tags, noise=noise, process=process, **options)
 
 
-def parse_filter(text: str, options: Mapping[str, Any] | None = None) -> tuple[str, dict[str, Any]]:
+def parse_filter(text: Any, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
     """Parse ``name/option=value/option=value`` to the name of a filter and its options.
 
     Parameters
     ----------
     text
         Name of a filter, with or without options. A value is JSON (``true``, ``0.05``,
-        ``[1, 2]``), or else text (``late``).
+        ``[1, 2]``), or else text (``late``). A factory is returned as it is.
     options
         Further options.
 
@@ -214,8 +222,10 @@ def filter_text(name: str, options: Mapping[str, Any]) -> str:
     return "/".join((name, *(f"{key}={value}" for key, value in values.items())))
 
 
-def factory_of(name: str) -> Callable[..., Filter]:
-    """Return the factory of a name: registered, of an entry point, or imported."""
+def factory_of(name: str | Callable[..., Filter]) -> Callable[..., Filter]:
+    """Return the factory of a name: registered, of an entry point, or imported; or the factory."""
+    if callable(name):
+        return name
     if isinstance(name, str) and name in _FACTORIES:
         return _FACTORIES[name]
     found = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name == name]
@@ -225,18 +235,19 @@ def factory_of(name: str) -> Callable[..., Filter]:
         return imported("filter", name)
     raise ValueError(
         f"filter must be one of {', '.join(names())}, or a name given by "
-        f"rbl_gym.estimators.register, or 'module:factory', got {name!r:.80}"
+        "rbl_gym.estimators.register, or 'module:factory', or a class or function that makes the "
+        f"filter, got {name!r:.80}"
         f"{did_you_mean(name, names())}"
     )
 
 
-def check_takes_noise(name: str, filter: Filter, why: str) -> None:
+def check_takes_noise(name: str | Callable[..., Filter], filter: Filter, why: str) -> None:
     """Raise ValueError if the `update` of a filter has no argument `noise`.
 
     Parameters
     ----------
     name
-        Name of the filter, for the message.
+        Name or factory of the filter, for the message.
     filter
         The filter.
     why

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -22,7 +22,8 @@ from rbl_gym.worlds.stacked import StackedScenes
 from rbl_gym.wrappers.observations import Seen, ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
-FilterLike = str | Mapping[str, Any]
+FilterName = str | Callable[..., Filter]
+FilterLike = FilterName | Mapping[str, Any]
 _FIGURES = metrics.Figures._fields
 
 
@@ -46,7 +47,9 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     filter
         Name of a filter (`rbl_gym.estimators.names`), with options as in ``"iekf/robust=true"``
         (`rbl_gym.estimators.parse_filter`); or a dict with its `name` and options, for example
-        ``{"name": "iekf", "robust": True}``.
+        ``{"name": "iekf", "robust": True}``; or a factory, a class or function with the arguments
+        `tags`, `noise`, `process` and its options. A factory cannot be written into the JSON of a
+        spec; ``"module:factory"`` can.
     options
         Further options of the filter, a JSON-able dict, for example ``{"robust": True}``.
     reward
@@ -201,8 +204,11 @@ def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
 
 def named_filter(
     filter: FilterLike, options: Mapping[str, Any] | None
-) -> tuple[str, Mapping[str, Any] | None]:
-    """Return name and options of a filter given by its name and options, or by a dict with both."""
+) -> tuple[FilterName, Mapping[str, Any] | None]:
+    """Return name and options of a filter given by its name and options, or by a dict with both.
+
+    A factory in place of the name is returned as it is.
+    """
     if not isinstance(filter, Mapping):
         return parse_filter(filter, check_options_of(options))
     if options is not None:
@@ -212,12 +218,14 @@ def named_filter(
         )
     told = dict(filter)
     name = told.pop("name", None)
-    if not isinstance(name, str):
+    if not isinstance(name, str) and not callable(name):
         raise ValueError(f"filter must be a name, or a dict with a name, got {filter!r:.80}")
     return parse_filter(name, told)
 
 
-def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
+def make_filter(
+    env: Any, scene: Scene, name: FilterName, options: Mapping[str, Any] | None
+) -> Filter:
     """Return a named filter for the scene's tags and the laws of the measurements of `env`."""
     told = check_options_of(options)
     law = getattr(env.unwrapped, "noise", scene.noise)
@@ -226,7 +234,9 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
     return scene_filter(scene, name, told, law)
 
 
-def scene_filter(scene: Scene, name: str, options: Mapping[str, Any], noise: Any = None) -> Filter:
+def scene_filter(
+    scene: Scene, name: FilterName, options: Mapping[str, Any], noise: Any = None
+) -> Filter:
     """Return a named filter with the tags and laws of the scene.
 
     Parameters
@@ -264,7 +274,7 @@ def scene_filter(scene: Scene, name: str, options: Mapping[str, Any], noise: Any
     return filter
 
 
-def _inertial_options(name: str, scene: Scene) -> dict[str, Any]:
+def _inertial_options(name: FilterName, scene: Scene) -> dict[str, Any]:
     """Return options for a filter with an inertial sensor, if the scene has one."""
     if scene.inertial is None:
         return {}

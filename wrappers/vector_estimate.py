@@ -17,6 +17,7 @@ from rbl_gym.estimators.filter import reads
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import (
     FilterLike,
+    FilterName,
     family_of,
     make_filter,
     measured_of,
@@ -242,7 +243,9 @@ class _Part(NamedTuple):
         return unpadded(told, self.scene) if padded else told
 
 
-def _takes_stacks(env: Any, scene: Any, filter: str, options: Mapping[str, Any] | None) -> bool:
+def _takes_stacks(
+    env: Any, scene: Any, filter: FilterName, options: Mapping[str, Any] | None
+) -> bool:
     """Return whether a filter accepts tags and noise per world; others group equal worlds."""
     try:
         make_filter(env, scene, filter, options)

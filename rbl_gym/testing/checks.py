@@ -37,6 +37,7 @@ from rbl_gym.testing.worlds import (
     check_same,
     check_shapes,
     draw_epochs,
+    factory_of,
     moved,
     moved_world,
     require,
@@ -50,7 +51,7 @@ _EPOCHS, _TRIALS = 12, 64
 
 
 def check_filter(
-    make_filter: Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0
+    make_filter: str | Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0
 ) -> None:
     """Check that a filter conforms to `rbl_gym.estimators.Filter`.
 
@@ -58,7 +59,8 @@ def check_filter(
     ----------
     make_filter
         Called as ``make_filter(tags=..., noise=..., process=...)``; the factory that is registered
-        or named by an entry point of the group ``rbl_gym.filters``. A filter whose attribute
+        or named by an entry point of the group ``rbl_gym.filters``. Or its path,
+        ``"module:factory"``. A filter whose attribute
         `reads` is ``"inertial"`` gets the readings of a default `InertialSensor` instead of twists.
     skip
         Checks to leave out, by the names below.
@@ -76,7 +78,7 @@ def check_filter(
         argument of `update`, only for that epoch), ``nan`` (raises ValueError), ``nees`` (the
         belief is consistent and better than the prior).
     """
-    _try_all(_FILTER_CHECKS, make_filter, skip, seed)
+    _try_all(_FILTER_CHECKS, factory_of(make_filter), skip, seed)
 
 
 def check_locator(locate: Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0) -> None:

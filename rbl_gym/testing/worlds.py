@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import metrics, motion
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, imported
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import inertial, ranging
 
@@ -93,6 +93,18 @@ def require(condition: Any, message: str) -> None:
     """Raise AssertionError with the message if false, also under ``python -O``."""
     if not condition:
         raise AssertionError(message)
+
+
+def factory_of(make_filter: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Return the factory of a path ``"module:factory"``, or the factory itself."""
+    if not isinstance(make_filter, str):
+        return make_filter
+    if ":" not in make_filter:
+        raise ValueError(
+            "make_filter must be a class, a function or 'module:factory'; for a filter with a name "
+            f"write functools.partial(rbl_gym.estimators.make, {make_filter!r:.80})"
+        )
+    return imported("make_filter", make_filter)
 
 
 def call(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
