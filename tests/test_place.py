@@ -295,7 +295,7 @@ def test_coplanar_anchors_are_warned_of(capsys):
     assert result["coplanar"]
     assert result["criteria"]["conditioning"] is None
     (warning,) = place_answer.warnings(result)
-    assert "mirror image" in warning
+    assert "on the other side of the plane" in warning
     assert "add a fourth" in warning
     place_summary.print_place(result)
     shown = capsys.readouterr().out

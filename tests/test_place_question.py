@@ -439,6 +439,7 @@ def test_a_zone_that_is_too_close_to_tell_is_explained():
         {
             "notes": [],
             "coplanar": False,
+            "layouts": {},
             "zones": [row, {"verdict": "pass"}],
             "check": {"filters": {}},
         }
@@ -457,6 +458,7 @@ def test_a_check_that_contradicts_the_prediction_is_told():
     result = {
         "notes": [],
         "coplanar": False,
+        "layouts": {},
         "zones": [],
         "check": {"filters": {"a": good, "b": bad}},
     }

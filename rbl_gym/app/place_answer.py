@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from rbl_gym.app.place_notes import NAMES, deciding_notes, nees_notes, usual_notes
+
 # Verdicts also have a sign and a word, because not everyone can distinguish colours.
 SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? TOO CLOSE", "no requirement": "-"}
 # Verdicts as tables show them.
@@ -12,11 +14,6 @@ HOW_TO_ASK = (
     "For a verdict, state requirements: use [[zones]] in the file, in place of [region], each with "
     "low, high, position_m or heading_deg, and share."
 )
-_NAMES = {
-    "position_m": ("horizontal position", "m"),
-    "height_m": ("height", "m"),
-    "heading_deg": ("heading", "deg"),
-}
 
 
 class ZoneAnswer(NamedTuple):
@@ -54,16 +51,17 @@ def headline(result: dict[str, Any]) -> str:
 def warnings(result: dict[str, Any]) -> list[str]:
     """Return what a reader has to know beside the verdict.
 
-    Notes on the file, a mirror image, zones that are too close to tell, a check that contradicts
-    the prediction.
+    Notes on the file, the requirement that decides, usual layouts that are better in a part, a
+    mirror image, zones that are too close to tell, a check that contradicts the prediction.
     """
-    found = list(result["notes"])
+    found = [*result["notes"], *deciding_notes(result), *usual_notes(result)]
     if result["coplanar"]:
         found.append(
-            "All anchors lie in one plane. Each pose has a mirror image on the other side of the "
-            "plane that fits the ranges as well, so a filter must know the side (rbl-gym replay "
-            "--volume or --below-anchors). The linear filters (kf, uc-kf, et-kf, kf-ortho) do not "
-            f"work. {_way_out(result)}"
+            "All anchors lie in one plane. A body on the other side of the plane (for anchors on a "
+            "ceiling: above it) has the same ranges. This is harmless if the body cannot be there "
+            "and the filter is told so (rbl-gym replay --below-anchors or --volume). Without this, "
+            "a filter may follow the wrong side, and the linear filters (kf, uc-kf, et-kf, "
+            f"kf-ortho) do not work. {_way_out(result)}"
         )
     for zone in result["zones"]:
         if zone["verdict"] == "undecided":
@@ -74,23 +72,22 @@ def warnings(result: dict[str, Any]) -> list[str]:
                 f"{percent(zone['required']['share'])} must be. Treat it as not met: add an "
                 "anchor, or require a little less."
             )
-    return found + _contradictions(result)
+    return found + _contradictions(result) + nees_notes(result)
 
 
 def _way_out(result: dict[str, Any]) -> str:
-    """Return what removes the mirror image of coplanar anchors."""
+    """Return what removes the ambiguity of coplanar anchors."""
     if result["n_anchors"] < 4:
         return "Three anchors always lie in one plane: add a fourth outside it."
     move = result["out_of_plane"]
     if move is None:
         return (
-            "It is not enough to move one anchor to another mount: at more than 5 % of the "
-            "positions the mirror image then still differs by less than 5 standard deviations. "
-            "Move more than one out of the plane, or allow mounts at another height."
+            "Mount at least two anchors outside the plane, or allow mounts at another height: no "
+            "exchange of one anchor removes the ambiguity."
         )
     where = ", ".join(f"{move[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
     return (
-        f"Anchor {move['anchor']} moved to ({where}), {move['mount']}, removes the mirror image; "
+        f"Anchor {move['anchor']} moved to ({where}), {move['mount']}, removes the ambiguity; "
         f"the tag error b is then {digits(move['ratio'])} times as large."
     )
 
@@ -126,7 +123,7 @@ def typical(zones: list[dict[str, Any]]) -> str:
     """Return typical errors of the zones: the smallest and the largest median."""
     parts = []
     for key in ("position_m", "heading_deg"):
-        name, unit = _NAMES[key]
+        name, unit = NAMES[key]
         medians = sorted(zone[key]["median"] for zone in zones)
         span = digits(medians[0])
         if digits(medians[-1]) != span:
@@ -156,7 +153,7 @@ def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
             required = zone["required"]
             limits = [
                 f"{name} {required[key]:g} {unit}"
-                for key, (name, unit) in _NAMES.items()
+                for key, (name, unit) in NAMES.items()
                 if required.get(key) is not None
             ]
             asks = f"{' and '.join(limits)} in {percent(required['share'])} of the zone"
@@ -166,7 +163,7 @@ def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
             )
         figures = ", ".join(
             f"{name} {digits(zone[key]['median'])} {unit} (95 %: {digits(zone[key]['p95'])})"
-            for key, (name, unit) in _NAMES.items()
+            for key, (name, unit) in NAMES.items()
             if key in zone
         )
         found.append(ZoneAnswer(zone["name"], zone["verdict"], asks, reached, figures))

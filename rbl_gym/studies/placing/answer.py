@@ -324,6 +324,7 @@ def _comparison(
     own = "given" if found.method == "given" else "designed"
     table = {own: _summary(problem, found.anchors, judged)} | {
         name: _summary(problem, anchors, judge_beside(problem, anchors, judged, survive))
+        | {"anchors_m": anchors.tolist()}
         for name, anchors in design.usual_layouts(problem, seed).items()
     }
     least = next(iter(table.values()))["score_m"]

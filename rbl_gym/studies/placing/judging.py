@@ -192,6 +192,8 @@ def short_row(judged: Judged) -> dict[str, Any]:
     - ``margin``: the requirement over the value reached at the required share; 1.2 leaves 20 %.
     - ``would_pass``: the value of each limit that would pass with the others unchanged, and the
       ``factor`` on all limits that would pass; None if no value would.
+    - ``decides``: the requirement with the largest value at the required share, relative to its
+      limit; this ``value`` (None if infinite) and the ``limit``.
     - ``rms_position_m`` (horizontal), ``rms_height_m``, ``rms_heading_deg``, ``rms_score_m``.
     """
     zone = judged.zone
@@ -218,6 +220,7 @@ def short_row(judged: Judged) -> dict[str, Any]:
             },
             "margin": float(1 / value_at_share(relative, zone.share)),
             "would_pass": would_pass(judged),
+            "decides": _decides(judged),
         }
     return row | {f"rms_{name}": float(rms(v)) for name, v in told(judged.judged).items()}
 
@@ -320,6 +323,16 @@ def would_pass(judged: Judged) -> dict[str, float | None]:
         needed = float(value_at_share(np.where(within, values, np.inf), zone.share))
         result[key] = needed if math.isfinite(needed) else None
     return result
+
+
+def _decides(judged: Judged) -> dict[str, Any]:
+    """Return the requirement that is missed most, or met with the least margin."""
+    zone, values = judged.zone, told(judged.judged)
+    asked = {key: limit for key in _KEYS.values() if (limit := getattr(zone, key)) is not None}
+    reached = {key: float(value_at_share(values[key], zone.share)) for key in asked}
+    key = max(asked, key=lambda one: reached[one] / asked[one])
+    value = reached[key] if math.isfinite(reached[key]) else None
+    return {"requirement": key, "value": value, "limit": asked[key]}
 
 
 def worst_places(judged: Judged) -> list[dict[str, float]]:

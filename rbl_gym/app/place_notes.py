@@ -1,0 +1,126 @@
+"""Notes on a placement: the requirement that decides, better usual layouts, weak geometry."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rbl_gym.app.page import digits
+
+NAMES = {
+    "position_m": ("horizontal position", "m"),
+    "height_m": ("height", "m"),
+    "heading_deg": ("heading", "deg"),
+}
+# A usual layout is mentioned if its b is smaller by this factor.
+_MUCH_SMALLER = 2.0
+# The NEES of a consistent filter is 6, the number of unknowns; a note above this multiple of it.
+_UNKNOWNS, _HIGH_NEES = 6, 1.5
+
+
+def deciding_notes(result: dict[str, Any]) -> list[str]:
+    """Return which requirement decides, for the zones that fail or would with one anchor less."""
+    found = [(zone, "") for zone in result["zones"]]
+    less = (result.get("fewest") or {}).get("one_less")
+    if less is not None:
+        found += [(zone, f"With {less['n_anchors']} anchors, ") for zone in less["zones"]]
+    texts, longest = [], 0.0
+    for zone, where in found:
+        if zone["verdict"] != "fail" or "decides" not in zone:
+            continue
+        decides = zone["decides"]
+        name, unit = NAMES[decides["requirement"]]
+        value, limit = decides["value"], decides["limit"]
+        reached = (
+            "it is not determined"
+            if value is None
+            else f"{digits(value, 3)} {unit} (required: {limit:g} {unit})"
+        )
+        texts.append(
+            f"{where}the {name} decides in zone {zone['name']!r}: at "
+            f"{100 * zone['required']['share']:g} % of the positions {reached}"
+        )
+        if decides["requirement"] == "heading_deg" and value is not None:
+            longest = max(longest, value / limit)
+    if not texts:
+        return []
+    texts[0] = texts[0][0].upper() + texts[0][1:]
+    return [f"{'; '.join(texts)}.{_spacing(result, longest)}"]
+
+
+def _spacing(result: dict[str, Any], factor: float) -> str:
+    """Return what distance of the tags a heading needs; the factor is its error over the limit."""
+    if factor <= 1:
+        return ""
+    tags = [tag[:2] for tag in result["tags_m"]]
+    span = max(math.dist(one, other) for one in tags for other in tags)
+    if span == 0:
+        return ""
+    return (
+        " The error of the heading is about inversely proportional to the distance between the "
+        f"tags: with these anchors, in place of {span:.2f} m, it would have to be about "
+        f"{span * factor:.2f} m. More anchors help less: twice the distance is worth about "
+        "four times as many anchors."
+    )
+
+
+def usual_notes(result: dict[str, Any]) -> list[str]:
+    """Return a note if a usual layout passes more zones than the designed one, or has a small b."""
+    rows = dict(result["layouts"])
+    own = rows.pop("designed", None)
+    if own is None or not rows or own["verdict"] == "no requirement":
+        return []
+    asked = sum("share" in zone for zone in own["zones"])
+    most = max(rows, key=lambda name: _passed(rows[name]))
+    least = min(rows, key=lambda name: rows[name]["score_m"])
+    small, large = rows[least]["score_m"], own["score_m"]
+    found, names = [], []
+    if _passed(rows[most]) > _passed(own):
+        names.append(most)
+        found.append(
+            f"The usual layout {most!r} passes more zones: {_passed(rows[most])} of {asked} (the "
+            f"designed layout: {_passed(own)})."
+        )
+    if large >= _MUCH_SMALLER * small:
+        names.append(least)
+        found.append(
+            f"The mean error b of the usual layout {least!r} is {digits(large / small, 2)} times "
+            f"smaller, {digits(small, 3)} m against {digits(large, 3)} m; it passes "
+            f"{_passed(rows[least])} of {asked} zones."
+        )
+    if not found:
+        return []
+    where = " and ".join(f"layouts.{name}.anchors_m" for name in dict.fromkeys(names))
+    return [
+        f"{' '.join(found)} If requirements are missed, the search only makes the smallest margin "
+        f"of all zones as large as it can. The positions are in the file of --json, {where}: to "
+        "use them, write them to a CSV file with the columns x_m,y_m,z_m for --layout."
+    ]
+
+
+def _passed(row: dict[str, Any]) -> int:
+    return sum(zone["verdict"] == "pass" for zone in row["zones"])
+
+
+def nees_notes(result: dict[str, Any]) -> list[str]:
+    """Return a note on each filter that agrees with the bound but claims too small errors."""
+    trials = result["check"].get("trials", 1)
+    most = _HIGH_NEES * _UNKNOWNS + 3 * math.sqrt(2 * _UNKNOWNS / trials)
+    found = []
+    for name, figures in result["check"]["filters"].items():
+        high = figures.get("nees", 0.0) > most and figures["holds"]
+        if not high or name.endswith("not told"):
+            continue
+        lost = 1 - figures["found"]
+        cause = (
+            f" {100 * lost:.3g} % of the bodies have a pose that is wrong by much more than the "
+            f"filter says; the NEES of the others is {figures['nees_found']:.2f}."
+            if lost > 0 and "nees_found" in figures
+            else ""
+        )
+        found.append(
+            f"The NEES of {name!r} is {figures['nees']:.2f}, and should be near {_UNKNOWNS}: its "
+            "errors are larger than its covariance says. The geometry is too weak for this filter."
+            f"{cause}"
+        )
+    return found

@@ -1,0 +1,96 @@
+"""Notes of a placement: the requirement that decides, better usual layouts, a high NEES."""
+
+import numpy as np
+import pytest
+
+from rbl_gym.app.place_notes import deciding_notes, nees_notes, usual_notes
+from rbl_gym.placement import scene_files
+from rbl_gym.studies.placing.judging import judge, short_row
+
+HALL = {
+    "mounts": [{"kind": "ceiling", "polygon": [[0, 0], [12, 0], [12, 8], [0, 8]], "height_m": 3}],
+    "zones": [
+        {
+            "name": "hall",
+            "polygon": [[1, 1], [11, 1], [11, 7], [1, 7]],
+            "low_m": 0.5,
+            "high_m": 1.5,
+            "attitude": "heading",
+            "position_m": 0.5,
+            "heading_deg": 2.0,
+            "share": 0.9,
+        }
+    ],
+    "body": {"tags": [[0.3, 0, 0], [-0.3, 0, 0]]},
+    "noise": {"floor_m": 0.1},
+    "anchors": {"number": 4},
+}
+ANCHORS = np.array([[0.5, 0.5, 3], [11.5, 0.5, 3], [11.5, 7.5, 3], [0.5, 7.5, 3.0]])
+
+
+def judged_row(problem):
+    (judged,) = judge(problem, ANCHORS, 0)
+    return judged, short_row(judged)
+
+
+def test_the_requirement_that_decides_and_the_distance_of_the_tags_that_meets_it():
+    problem = scene_files.of_mapping(HALL)
+    judged, row = judged_row(problem)
+    decides = row["decides"]
+    assert decides["requirement"] == "heading_deg"
+    assert decides["limit"] == 2.0
+    errors = np.sort(np.rad2deg(judged.judged.heading))
+    assert decides["value"] == errors[int(np.ceil(0.9 * len(errors))) - 1]
+    assert decides["value"] > 2 * judged.judged.horizontal.max() / 0.5
+    (note,) = deciding_notes({"zones": [row], "tags_m": problem.tags.tolist()})
+    assert note.startswith("The heading decides in zone 'hall': at 90 % of the positions ")
+    needed = 0.6 * decides["value"] / 2
+    assert f"in place of 0.60 m, it would have to be about {needed:.2f} m" in note
+    # With that distance the error is the limit: the rule holds to 5 %.
+    tags = [[needed / 2, 0, 0], [-needed / 2, 0, 0]]
+    wider = scene_files.of_mapping(HALL | {"body": {"tags": tags}})
+    assert judged_row(wider)[1]["decides"]["value"] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_position_that_decides_with_one_anchor_less():
+    zone = {
+        "name": "a", "verdict": "fail", "required": {"share": 0.95},
+        "decides": {"requirement": "position_m", "value": None, "limit": 0.3},
+    }  # fmt: skip
+    result = {"zones": [zone | {"verdict": "pass"}], "tags_m": [[0, 0, 0]]}
+    assert deciding_notes(result) == []
+    result["fewest"] = {"one_less": {"n_anchors": 5, "zones": [zone]}}
+    assert deciding_notes(result) == [
+        "With 5 anchors, the horizontal position decides in zone 'a': at 95 % of the positions it "
+        "is not determined."
+    ]
+
+
+def layout(score_m, *verdicts):
+    zones = [{"verdict": verdict, "share": 0.5} for verdict in verdicts]
+    overall = "pass" if set(verdicts) == {"pass"} else "fail"
+    return {"score_m": score_m, "verdict": overall, "zones": zones}
+
+
+def test_a_usual_layout_that_passes_more_zones_or_has_a_much_smaller_b_is_named():
+    layouts = {"designed": layout(1.2, "fail", "fail"), "grid": layout(1.0, "pass", "fail")}
+    (note,) = usual_notes({"layouts": layouts})
+    assert note.startswith(
+        "The usual layout 'grid' passes more zones: 1 of 2 (the designed layout: 0). If"
+    )
+    layouts = {"designed": layout(1.2, "pass", "pass"), "ring": layout(0.12, "pass", "fail")}
+    (note,) = usual_notes({"layouts": layouts})
+    assert "b of the usual layout 'ring' is 10 times smaller, 0.120 m against 1.20 m" in note
+    assert "layouts.ring.anchors_m" in note
+    layouts["ring"] = layout(0.9, "pass", "pass")
+    assert usual_notes({"layouts": layouts}) == []
+    assert usual_notes({"layouts": {"given": layouts["designed"], "ring": layouts["ring"]}}) == []
+
+
+def test_a_nees_that_is_too_large_is_told_although_the_errors_agree():
+    row = {"found": 0.99, "holds": True, "nees": 19.94, "nees_found": 6.1}
+    filters = {"iterated EKF": row, "iterated EKF, not told": row, "locate": row | {"nees": 6.9}}
+    (note,) = nees_notes({"check": {"trials": 500, "filters": filters}})
+    assert note.startswith("The NEES of 'iterated EKF' is 19.94, and should be near 6")
+    assert "1 % of the bodies" in note
+    assert note.endswith("the NEES of the others is 6.10.")
