@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 
 from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.metrics import Figures
 from rbl_gym.wrappers import EstimatePose
+from rbl_gym.wrappers.observations import Seen
 from rbl_gym.wrappers.rewards import REWARDS, Outcome, reward_of
 from tests.test_tracking_vector_env import ID, short
 
@@ -132,3 +136,27 @@ def test_what_a_function_returns_is_checked(reward, named):
 
 def test_every_name_is_documented():
     assert all(function.__doc__ for function in REWARDS.values())
+
+
+def table_of(name: str) -> dict[str, str]:
+    """Return the second column of the table of the fields of `name`, by the first column."""
+    page = Path(__file__).parents[1] / "docs/environments/wrappers.md"
+    table = page.read_text(encoding="utf-8").split(f"| field of `{name}` |")[1].split("\n\n")[0]
+    rows = [line.split("|") for line in table.splitlines()[2:]]
+    return {row[1].strip(" `"): row[2].strip() for row in rows}
+
+
+def test_the_page_has_every_field_of_an_outcome_with_its_shape():
+    seen: list[Outcome] = []
+    step_of(short("uwb_room", 4), lambda outcome: seen.append(outcome) or 0.0)
+    table = table_of("Outcome")
+    whole = {"figures": Figures, "belief": PoseBelief}
+    names = [f"{f}.{part}" for f in whole for part in whole[f]._fields]
+    assert {*table} == {*names, *Outcome._fields} - {*whole}
+    for field, shape in table.items():
+        value: Any = seen[0]
+        for part in field.split("."):
+            value = getattr(value, part)
+        if shape.startswith("("):
+            assert str(np.shape(value)) == shape, field
+    assert {*table_of("Seen")} == {*Seen._fields} <= {*Outcome._fields}
