@@ -394,6 +394,7 @@ def test_a_file_takes_one_run_unless_it_is_replaced(tmp_path, short, capsys):
     said = capsys.readouterr().err
     assert "has records with seed 0, but this run has 1" in said
     assert "with --out F, or drop the old records with --fresh" in said
+    assert "versions" not in said
     status, other = bench(tmp_path, *options, "--seed", 1, "--fresh")
     assert status == 0
     assert rows(other)[0]["tags_m"] != rows(first)[0]["tags_m"]

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import pickle
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -243,8 +244,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"noise": {"kind": "range", "floor": 1}}, "scene.noise has no field 'floor'"),
     ({"dt": {"value": 1}}, "scene.dt must be one value, got the dict {'value': 1}"),
-    ({"noise": 0.1}, "scene.noise must be a dict of its fields, got 0.1"),
-    ({"links": None}, "scene.links must be a dict of its fields, got None"),
+    ({"noise": 0.1}, "scene.noise must be a dict of its fields (floor_m, proportional, "),
+    ({"links": None}, "scene.links must be a dict of its fields (drop_probability, "),
     # kinds
     ({"noise": {"kind": "loud"}}, "scene.noise.kind must be one of"),
     ({"noise": BOX}, "scene.noise.kind must be one of 'range', 'squared-range'"),
@@ -293,6 +294,16 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 def test_bad_override_is_refused(overrides, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         scenes.get({"name": "uwb_room", **overrides})
+
+
+def test_the_page_and_the_error_have_the_same_fields():
+    page = Path(__file__).parents[1] / "docs/environments/index.md"
+    table = page.read_text(encoding="utf-8").split("## Fields of a scene")[1].split("\n\n")[1]
+    names = [name for line in table.splitlines()[2:] for name in line.split("|")[1].split(",")]
+    with pytest.raises(ValueError, match="scene has no field") as refused:
+        scenes.get({"name": "uwb_room", "colour": 1})
+    listed = str(refused.value).split("its fields are ")[1].split(", ")
+    assert sorted(name.strip(" `") for name in names) == listed
 
 
 # --- the limit of the ranges ------------------------------------------------------------------

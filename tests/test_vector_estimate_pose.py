@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.wrappers import VectorEstimatePose
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
 from tests.test_tracking_vector_env import ID, short
 
@@ -74,3 +74,9 @@ def test_wrong_environments_and_names_are_named():
         VectorEstimatePose(gym.make_vec("CartPole-v1", num_envs=2))
     with pytest.raises(ValueError, match=r"reward must be one of 'belief'.*got 'gold'"):
         VectorEstimatePose(TrackingVectorEnv(2), reward="gold")
+    mistaken: Any = TrackingVectorEnv(2)
+    with pytest.raises(ValueError, match=r"got the vector environment .*: use VectorEstimatePose"):
+        EstimatePose(mistaken)
+    mistaken = gym.make(ID)
+    with pytest.raises(ValueError, match=r"got the single environment .*: use EstimatePose"):
+        VectorEstimatePose(mistaken)

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv
 
 from rbl_gym import estimators, metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray
@@ -92,6 +93,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(
             self, filter=filter, options=options, reward=reward, observation=observation
         )
+        if isinstance(env, VectorEnv):
+            raise ValueError(
+                f"env must be one environment, got the vector environment {env}: use "
+                "VectorEstimatePose"
+            )
         gym.Wrapper.__init__(self, env)
         self._scene = scene_of(env)
         self._reward = reward_of(reward)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
@@ -61,6 +62,11 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(
             self, filter=filter, options=options, reward=reward, observation=observation
         )
+        if isinstance(env, gym.Env):
+            raise ValueError(
+                f"env must be a vector environment, got the single environment {env}: use "
+                "EstimatePose"
+            )
         VectorWrapper.__init__(self, env)
         self._scene: Any = scene_of(env)
         self._named = named_filter(filter, options)

@@ -15,7 +15,7 @@ from rbl_gym.measurements.noise_laws import NOISE_FORMS, NOISE_LAWS
 _READ_BY_THEMSELVES = ("inertial",)
 
 
-def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
+def replace(base: Any, changes: Mapping[str, Any], path: str, others: tuple[str, ...] = ()) -> Any:
     """Return a copy of a frozen dataclass with changed fields; nested ones take mappings.
 
     Parameters
@@ -27,6 +27,8 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         with the key ``"kind"`` gives a complete region (`REGIONS`) or noise law (`NOISE_FORMS`).
     path
         Name of the dataclass in errors.
+    others
+        Further keys that the caller reads itself; the error of an unknown field lists them, too.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         If a field or kind is unknown, or a value is invalid.
     """
     fields = {entry.name for entry in dataclasses.fields(base)}
-    _check_fields(changes, fields, path)
+    _check_fields(changes, fields, path, others)
     values = {}
     for key, value in changes.items():
         old = getattr(base, key)
@@ -43,7 +45,10 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         elif isinstance(value, Mapping):
             values[key] = _nested(old, value, f"{path}.{key}")
         elif dataclasses.is_dataclass(old) and not dataclasses.is_dataclass(value):
-            raise ValueError(f"{path}.{key} must be a dict of its fields, got {value!r:.80}")
+            inner = ", ".join(entry.name for entry in dataclasses.fields(old))
+            raise ValueError(
+                f"{path}.{key} must be a dict of its fields ({inner}), got {value!r:.80}"
+            )
         else:
             values[key] = value
     try:
@@ -52,12 +57,15 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _check_fields(given: Iterable[str], fields: Iterable[str], path: str) -> None:
+def _check_fields(
+    given: Iterable[str], fields: Iterable[str], path: str, others: Iterable[str] = ()
+) -> None:
+    known = sorted({*fields, *others})
     for key in given:
         if key not in fields:
             raise ValueError(
-                f"{path} has no field {key!r}; its fields are {', '.join(sorted(fields))}"
-                f"{did_you_mean(key, fields)}"
+                f"{path} has no field {key!r}; its fields are {', '.join(known)}"
+                f"{did_you_mean(key, known)}"
             )
 
 

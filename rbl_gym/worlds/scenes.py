@@ -241,7 +241,7 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     if anchors is not None:
         changes.setdefault("fixed", ())
         changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
-    made = overrides.replace(base, changes, "scene")
+    made = overrides.replace(base, changes, "scene", special)
     return _stretched(made, scene["stretch"]) if "stretch" in scene else made
 
 

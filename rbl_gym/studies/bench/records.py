@@ -105,10 +105,11 @@ def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None
     for record in records:
         for name in _COMMON:
             if record[name] != common[name]:
+                workers = ". All workers need the same versions" if name == "versions" else ""
                 raise ValueError(
                     f"{where} has records with {name} {record[name]}, but this run has "
                     f"{common[name]}, and a file holds one run: choose another file with --out F, "
-                    "or drop the old records with --fresh. All workers need the same versions"
+                    f"or drop the old records with --fresh{workers}"
                 )
 
 
