@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 
 from rbl_gym.app.figures import replay_figure
 from rbl_gym.app.reports import compared, print_replay
@@ -131,8 +132,8 @@ def test_a_clock_is_found_by_the_motion(align, ahead_s, with_rotation):
     assert errors.nees[errors.known].mean() / errors.freedom == pytest.approx(1, abs=0.4)
 
 
-def test_a_run_finds_the_clock_by_its_own_track():
-    """Of a smoothed track, which does not lag."""
+def recorded_run(truth):
+    """A recording of the curve with three tags, 12 s."""
     rng = np.random.default_rng(0)
     times = np.arange(0, 12, 0.1)
     rotation, place = curve(times)
@@ -140,9 +141,24 @@ def test_a_run_finds_the_clock_by_its_own_track():
     tags = (rotation @ TAGS.T).swapaxes(1, 2) + place[:, None]
     ranges = np.linalg.norm(anchors[:, None] - tags[:, None], axis=-1)
     ranges = ranges + 0.03 * rng.standard_normal(ranges.shape)
-    links, truth = np.ones(ranges.shape, bool), Truth(TIMES + 0.4, None, PLACE)
-    ids = tuple("abcdef"), tuple("xyz")
-    recording = Recording(times, ranges, links, None, anchors, TAGS, *ids, truth)
+    links, ids = np.ones(ranges.shape, bool), (tuple("abcdef"), tuple("xyz"))
+    return Recording(times, ranges, links, None, anchors, TAGS, *ids, truth)
+
+
+def test_an_offset_of_motions_that_hardly_agree_is_doubted():
+    rng = np.random.default_rng(4)
+    poor = PLACE + 1.5 * scipy.ndimage.gaussian_filter1d(rng.standard_normal(PLACE.shape), 6, 0)
+    for place, doubted in ((PLACE, False), (poor, True)):
+        settings = replay.Settings.of(range_std_m=0.1, time_offset="auto")
+        recording = recorded_run(Truth(TIMES + 0.4, None, place))
+        figures = replay.replay_recording(recording, settings).figures
+        assert (figures["time_offset"]["correlation"] < 0.9) == doubted
+        assert any("time offset" in n and "unreliable" in n for n in figures["notes"]) == doubted
+
+
+def test_a_run_finds_the_clock_by_its_own_track():
+    """Of a smoothed track, which does not lag."""
+    recording = recorded_run(Truth(TIMES + 0.4, None, PLACE))
     off = {}
     for smooth in (False, True):
         settings = replay.Settings.of(walk_m=0.1, walk_deg=15, range_std_m=0.1, robust=False,

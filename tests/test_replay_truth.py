@@ -175,6 +175,15 @@ def test_a_constant_fault_is_hinted(name, step_s):
     assert re.search(words, result["notes"][0]), result["notes"]
 
 
+def test_a_shift_is_hinted_even_if_the_beliefs_are_wide():
+    recording, track = pair(transformed(late_s=0.3))
+    wide = track._replace(covariance=400 * track.covariance)
+    errors = replay.track_errors(recording, wide, replay.Settings())
+    figures = replay.track_figures(recording, wide, errors, replay.Settings())
+    assert figures["anees"] < 0.3
+    assert re.search(r"clock looks about 0.(25|30|35) s ahead", figures["notes"][-1])
+
+
 def test_two_faults_are_both_hinted():
     truth = transformed((0, 0, 0.6), (1, 2, 0))
     assert truth.rotation is not None

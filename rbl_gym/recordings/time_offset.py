@@ -216,7 +216,8 @@ def _coarse(a: _Signal, b: _Signal, step: float, search: float) -> tuple[float, 
     ends = np.flatnonzero(tried)[[0, -1]]
     if best in ends and ends[0] != ends[1]:
         raise ValueError(
-            f"signals agree best at the end of the search, {offsets[best]:.4g} s: increase search_s"
+            f"signals agree best at the end of the search, {offsets[best]:.4g} s, so the offset is "
+            "outside of it or not determined"
         )
     _check_rivals(offsets, correlation, best)
     return float(offsets[best]), float(correlation[best])
@@ -239,7 +240,7 @@ def _check_rivals(offsets: FloatArray, correlation: FloatArray, best: int) -> No
         raise ValueError(
             f"signals agree as well at an offset of {offsets[rival]:.4g} s as at "
             f"{offsets[best]:.4g} s (correlations {correlation[rival]:.3f} and "
-            f"{correlation[best]:.3f}): decrease search_s, or give the offset"
+            f"{correlation[best]:.3f}): periodic motion"
         )
 
 

@@ -130,7 +130,9 @@ def find_offset(recording: Recording, track: Track, settings: Settings) -> TimeO
             one_frame=settings.comparison.align in ("none", "position"),
         )
     except ValueError as error:
-        raise ValueError(f"time_offset 'auto': {error}; give it in seconds") from error
+        raise ValueError(
+            f"time_offset 'auto': {error}; give it in seconds (--time-offset S)"
+        ) from error
 
 
 def in_clock(truth: Truth, settings: Settings) -> Truth:

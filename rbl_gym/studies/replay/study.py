@@ -27,6 +27,9 @@ from rbl_gym.studies.replay.truth import check_overlap
 
 __all__ = ["Replayed", "check_replay", "replay_recording"]
 
+# Correlation of the motions below which an estimated time offset is reported as unreliable.
+_RELIABLE = 0.9
+
 
 class Replayed(NamedTuple):
     """The result of a replayed recording.
@@ -110,12 +113,23 @@ def replay_recording(
         lags = smoothed is None
         figures["time_offset"] = {**offset._asdict(), "track": "causal" if lags else "smoothed"}
     figures["consistency"], notes = diagnose(recording, settings, track)
-    figures["notes"] = figures["notes"] + notes
+    figures["notes"] = figures["notes"] + ([] if offset is None else _offset_note(offset)) + notes
     if smoothed is None:
         return Replayed(settings, track, errors, figures)
     smoothed_errors = track_errors(recording, smoothed.track, settings)
     figures["smoothed"] = smoothed_figures(smoothed, smoothed_errors)
     return Replayed(settings, track, errors, figures, smoothed, smoothed_errors)
+
+
+def _offset_note(found: TimeOffset) -> list[str]:
+    if found.correlation >= _RELIABLE:
+        return []
+    return [
+        f"WARNING: the estimated time offset of the truth, {found.offset_s:.3f} s, is unreliable: "
+        f"the motion of track and truth has a correlation of only {found.correlation:.2f}. Check "
+        "that both are of one run, and the positions of the anchors, or give the offset in seconds "
+        "(--time-offset S)."
+    ]
 
 
 class _Stopwatch:
