@@ -222,6 +222,41 @@ def test_clock_by_hand():
     assert clock.std_s < 0.01
 
 
+def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way():
+    """A tag further ahead looks like a later clock, and lost ranges change what is known."""
+    hall = np.array(
+        [[0, 0, 2.6], [12, 0, 2.2], [12, 8, 2.7], [0, 8, 2.3], [6, 0, 1.2], [6, 8, 1.5]]
+    )
+    z, times, tags = [], 0.1 * np.arange(600), TAGS[:2]
+
+    def pose(at):
+        w = 0.21
+        place = np.stack([6 + 4 * np.sin(w * at), 4 + 2.4 * np.sin(2 * w * at + 0.3), 0 * at], -1)
+        yaw = np.arctan2(4.8 * np.cos(2 * w * at + 0.3), 4 * np.cos(w * at))
+        return Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]).as_matrix(), place
+
+    rotation, place = pose(times)
+    places = place[:, None] + tags @ np.swapaxes(rotation, -1, -2)
+    d = np.linalg.norm(places[:, None] - hall[:, None], axis=-1)
+    on_truth = np.arange(0, 60, 0.02)
+    truth = Truth(on_truth + 0.3, *pose(on_truth))
+    settings = calibrate.LinkSettings(slopes=False, planar=True)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        ranges = d + 0.08 * rng.standard_normal(d.shape)
+        ranges += np.where(rng.random(d.shape) < 0.05, rng.uniform(0.5, 4, d.shape), 0)
+        ranges[rng.random(d.shape) < 0.1] = 0
+        recording = recording_of(times, ranges, truth, tags)._replace(anchors=hall)
+        found = calibrate.calibrate_links(recording, settings)
+        assert found.clock is not None
+        assert found.clock.std_s < 0.02
+        z.append((found.clock.offset_s - 0.3) / found.clock.std_s)
+        assert (np.abs(found.fit.tags - tags)[:, :2] < 5 * found.fit.tags_std_m[:, :2] + 1e-3).all()
+    # Six squared deviations, sum below its 99.99 % point for Gaussian ones.
+    assert np.abs(z).max() < 4
+    assert np.square(z).sum() < 28
+
+
 def test_a_table_of_links_has_a_row_of_every_link_that_is_told(tmp_path):
     bias = np.array([[0.1, 0.2], [0.3, 0.4]])
     path = tmp_path / "new" / "calibration.csv"

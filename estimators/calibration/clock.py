@@ -7,10 +7,9 @@ second do not depend on slower errors: biases, slow multipath, small errors of l
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.calibration import robust
@@ -24,6 +23,8 @@ _SEARCH_STEP_S, _FEWEST, _BLOCK_S = 0.1, 30, 2.0
 # Half-width of the finite difference for rates (s).
 _HALF_S = 0.02
 _LEAST_M = 1e-4
+# Gauss-Newton steps at most, and the step (s) below which they end.
+_STEPS, _CLOSE_S = 20, 1e-5
 
 Places = Callable[[float], tuple[FloatArray, BoolArray]]
 
@@ -36,8 +37,10 @@ class Clock(NamedTuple):
 
 
 def find_clock(
-    times: FloatArray, ranges: FloatArray, links: BoolArray, distances: Places, search_s: float
-) -> Clock | None:
+    times: FloatArray, ranges: FloatArray, links: BoolArray, distances: Places,
+    search_s: float,
+    moves: Callable[[float], FloatArray] | None = None,
+) -> Clock | None:  # fmt: skip
     """Estimate the time shift at which distances along a path change as the ranges do.
 
     Parameters
@@ -51,6 +54,10 @@ def find_clock(
         a mask (K,) of epochs with known distances.
     search_s
         Shifts up to this are tried, in both directions.
+    moves
+        Function of a shift. It returns the derivatives (K, M, N, D) of the distances with respect
+        to D unknowns of the tags, times their prior standard deviations. These are estimated too: a
+        tag further ahead on the body looks like a later clock where the speed is constant.
 
     Returns
     -------
@@ -63,7 +70,7 @@ def find_clock(
     grid = np.arange(-search_s, search_s + 1e-9, _SEARCH_STEP_S) if search_s > 0 else np.zeros(1)
     found: list[Clock] = []
     start: float | None = None
-    for lag in _LAGS_S:
+    for lag in _LAGS_S[::-1]:  # the longest is the surest start of the search
         changes = _changes(times, used, flat, distances, lag)
         if changes is None:
             continue
@@ -72,7 +79,8 @@ def find_clock(
             if not np.isfinite(spreads).any():
                 continue
             start = float(grid[int(np.argmin(spreads))])
-        clock = _refined(changes, start)
+        tags = np.zeros((K, 0)) if moves is None else moves(start)
+        clock = _refined(changes, start, tags.reshape(*flat.shape, -1))
         if clock is not None:
             found.append(clock)
     return min(found, key=lambda clock: clock.std_s, default=None)
@@ -84,6 +92,7 @@ class _Changes(NamedTuple):
     times: FloatArray  # (P,)
     change: FloatArray  # (P,) metres
     foretold: Callable[[float], tuple[FloatArray, BoolArray]]
+    of: Callable[[FloatArray], FloatArray]  # changes (P, ...) of values (K, L, ...)
 
     def left(self, shift: float) -> tuple[FloatArray, BoolArray]:
         """Return the residual changes at a shift, and a mask of the known ones."""
@@ -96,30 +105,52 @@ class _Changes(NamedTuple):
         return float(robust.spread(e, known, _LEAST_M)) if known.sum() >= _FEWEST else np.inf
 
 
-def _refined(changes: _Changes, start: float) -> Clock | None:
-    """Return the shift near `start` with the least residuals, and its standard deviation."""
-    std = changes.spread(start)
+def _refined(changes: _Changes, start: float, moves: FloatArray) -> Clock | None:
+    """Return the shift near `start` with the least residuals, and its standard deviation.
 
-    def cost(shift: float) -> float:
-        e, known = changes.left(shift)
-        return float(robust.loss_of(e[known] / std).mean()) if known.any() else np.inf
-
-    if not np.isfinite(std):
+    Gauss-Newton with iterated weights, jointly with the moves (K, L, D) of the tags.
+    """
+    half = 1.5 * _SEARCH_STEP_S
+    # One set of changes for all shifts: the loss would jump where a change enters or leaves.
+    ends = start - half - _HALF_S, start, start + half + _HALF_S
+    known = np.all([changes.left(shift)[1] for shift in ends], axis=0)
+    if known.sum() < _FEWEST:
         return None
-    bounds = start - 1.5 * _SEARCH_STEP_S, start + 1.5 * _SEARCH_STEP_S
-    found: Any = scipy.optimize.minimize_scalar(cost, bounds=bounds, options={"xatol": 1e-4})
-    offset = float(found.x)
-    e, known = changes.left(offset)
-    rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]
-    rate = (rate / (2 * _HALF_S * std))[known]
-    z = (e / std)[known]
+    std = float(robust.spread(changes.left(start)[0], known, _LEAST_M))
+    moved = changes.of(moves)[known] / std
+    offset, move = start, np.zeros(moved.shape[-1])
+    for _ in range(_STEPS):
+        z = changes.left(offset)[0][known] / std - moved @ move
+        rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]
+        rate = rate[known] / (2 * _HALF_S * std)
+        share = robust.share_of(z)
+        # The part of the rates that no move of the tags explains tells the clock.
+        weighted = moved * share[:, None]
+        inverse = np.linalg.inv(weighted.T @ moved + np.eye(len(move)))
+        own = rate - moved @ (inverse @ (weighted.T @ rate))
+        information = float((share * own * rate).sum())
+        if not information > 0:
+            return None
+        step = float((own * share * (z + moved @ move)).sum()) / information
+        step = float(np.clip(step, -_SEARCH_STEP_S, _SEARCH_STEP_S))
+        offset += step
+        move = inverse @ (weighted.T @ (z + moved @ move - rate * step))
+        if abs(offset - start) > half:
+            return None
+        if abs(step) < _CLOSE_S:
+            break
     # Changes overlap and errors are correlated, so scores are summed over blocks of time first.
     block = np.unique((changes.times[known] // _BLOCK_S).astype(int), return_inverse=True)[1]
-    score = np.bincount(block, z * robust.share_of(z) * rate)
-    information = float((rate**2).sum())
-    if information <= 0:
+    score = np.bincount(block, z * share * own)
+    # Late ranges lower the curvature of the loss.
+    curvature = np.where(share < 1, -share, 1.0).mean()
+    information = max(float(curvature), 0.1) * float((own * rate).sum())
+    unknowns = 1 + len(move)
+    if not (information > 0 and len(score) > unknowns):
         return None
-    return Clock(offset, float(np.sqrt((score**2).sum()) / information))
+    # The residuals are smaller than the errors: the unknowns are fitted to them.
+    factor = len(score) / (len(score) - unknowns)
+    return Clock(offset, float(np.sqrt(factor * (score**2).sum()) / information))
 
 
 def _changes(
@@ -139,9 +170,11 @@ def _changes(
     if len(first) < _FEWEST:
         return None
 
+    def of(values: FloatArray) -> FloatArray:
+        return values[second, link] - values[first, link]
+
     def foretold(shift: float) -> tuple[FloatArray, BoolArray]:
         d, known = distances(shift)
-        d = d.reshape(len(times), -1)
-        return d[second, link] - d[first, link], known[first] & known[second]
+        return of(d.reshape(len(times), -1)), known[first] & known[second]
 
-    return _Changes(times[first], ranges[second, link] - ranges[first, link], foretold)
+    return _Changes(times[first], of(ranges), foretold, of)

@@ -8,9 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.calibration import KnownPath, spread_of_residuals
+from rbl_gym.estimators.calibration import KnownPath, LinkModel, spread_of_residuals
 from rbl_gym.estimators.calibration.clock import Clock, find_clock
-from rbl_gym.estimators.calibration.link_equations import carried_tags, directions
+from rbl_gym.estimators.calibration.link_equations import (
+    ARM_M,
+    TURN_RAD,
+    axes_of,
+    carried_tags,
+    directions,
+)
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import truth_at
@@ -130,15 +136,28 @@ def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
     return turns[best] if found[best] < _BETTER * found[0] else np.eye(3)
 
 
-def clock_of(log: Log, settings: LinkSettings, tags: FloatArray) -> Clock | None:
+def clock_of(
+    log: Log, settings: LinkSettings, tags: FloatArray, model: LinkModel | None = None
+) -> Clock | None:
     """Estimate how far the clock of the truth is ahead, from ranges; None if undetermined.
 
-    `tags` (N, 3) in the body frame of the truth.
+    `tags` (N, 3) in the body frame of the truth. With a `model` whose tags are not held, their
+    turn and shift are unknown.
     """
 
     def distances(shift: float) -> tuple[FloatArray, BoolArray]:
         path, known = path_at(log, settings, shift)
         return directions(log.anchors, carried_tags(path, tags))[1], known
 
-    found = find_clock(log.times, log.ranges, log.links, distances, _SEARCH_S)
+    def moves(shift: float) -> FloatArray:
+        path = path_at(log, settings, shift)[0]
+        away = directions(log.anchors, carried_tags(path, tags))[0]
+        away = np.einsum("kmni,kij->kmnj", away, path.rotation)
+        turn_axes, move_axes = axes_of(model or LinkModel())
+        turned = TURN_RAD * np.cross(tags, away)[..., turn_axes]
+        return np.concatenate([turned, ARM_M * away[..., move_axes]], axis=-1)
+
+    free = model is not None and model.tags != "held"
+    search = log.times, log.ranges, log.links, distances, _SEARCH_S
+    found = find_clock(*search, moves if free else None)
     return found if found is not None and found.std_s <= _CLOCK_STD_S else None

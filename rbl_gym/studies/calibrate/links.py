@@ -141,7 +141,7 @@ def calibrate_links(
     if clock is not None:
         # The clock is more accurate once the tags are at their estimated positions.
         coarse = fit_log(log, settings, first, turn, shift, few=True)
-        turn, clock = coarse.rotation, clock_of(log, settings, coarse.tags) or clock
+        turn, clock = coarse.rotation, clock_of(log, settings, coarse.tags, first) or clock
         shift = clock.offset_s
     advance()
     fit = fit_log(log, settings, first, turn, shift)
