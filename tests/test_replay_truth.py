@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import motion, recordings
+from rbl_gym.app import reports
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
@@ -182,6 +183,30 @@ def test_a_shift_is_hinted_even_if_the_beliefs_are_wide():
     figures = replay.track_figures(recording, wide, errors, replay.Settings())
     assert figures["anees"] < 0.3
     assert re.search(r"clock looks about 0.(25|30|35) s ahead", figures["notes"][-1])
+
+
+def test_the_rotation_of_one_tag_has_no_number():
+    recording, track = pair(Truth(*moving(0.05)))
+    for std, cells in ((4.0, ["undetermined", "", ""]), (0.01, None)):
+        covariance = track.covariance.copy()
+        covariance[:, :3, :3] = std**2 * np.eye(3)
+        wide = track._replace(covariance=covariance)
+        errors = replay.track_errors(recording, wide, replay.Settings())
+        figures = replay.track_figures(recording, wide, errors, replay.Settings())
+        rows = dict(reports.error_rows(figures, "xyz", reports.turn_open(figures)))
+        for name in ("yaw (deg)", "rotation (deg)"):
+            assert rows[name] == cells if cells else rows[name][0] != "undetermined"
+        assert rows["position xyz (m)"][0] == f"{figures['position_rmse_m']:.4f}"
+
+
+def test_a_truth_without_heights_hints_at_the_floor():
+    told = Truth(*moving(0.1))._replace(planar=True)
+    for settings, hinted in (
+        (replay.Settings(), True),
+        (replay.Settings.of(planar=True, height_m=0.0), False),
+    ):
+        notes = outcome(told, settings)["notes"]
+        assert any("--planar --height-m H" in note for note in notes) == hinted
 
 
 def test_two_faults_are_both_hinted():

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from rbl_gym.app.consistency import draw_nis
+from rbl_gym.app.reports import turn_open
 from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
@@ -300,8 +301,12 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     drawn = ((found, "iterated EKF"), (replayed.smoothed_errors, "KF"))
     for row, label in enumerate(labels):
         axes = figure.add_subplot(grid[row, 1])
+        unknown = row > 0 and turn_open(replayed.figures)
+        if unknown:
+            axes.text(0.5, 0.5, "undetermined", ha="center", va="center", transform=axes.transAxes)
+            axes.set(xlim=(0, track.times[-1] - track.times[0]), yticks=[])
         for errors, colour in drawn:
-            if errors is not None:
+            if errors is not None and not unknown:
                 values = errors.position
                 if row and errors.yaw is not None:
                     values = np.rad2deg(errors.yaw)

@@ -115,15 +115,25 @@ def print_replay(result: dict[str, Any]) -> None:
         return
     for line in compared(result):
         console.print(line)
-    _print_errors(console, "error", result, result["position_axes"])
+    axes, is_open = result["position_axes"], turn_open(result)
+    _print_errors(console, "error", result, axes, is_open)
     if "smoothed" in result:
-        _print_errors(console, "smoothed", result["smoothed"], result["position_axes"])
+        _print_errors(console, "smoothed", result["smoothed"], axes, is_open)
     print_consistency(console, result)
     _print_notes(console, result)
 
 
-def error_rows(result: dict[str, Any], axes: str) -> Iterator[tuple[str, int, list[float]]]:
-    """Return label, number of decimals, and RMSE, median and p95 of every known error."""
+def turn_open(result: dict[str, Any]) -> bool:
+    """Return whether the body has one tag, and nothing determines its rotation."""
+    one = "centre_rmse_m" in result and "axis_rmse_deg" not in result
+    return one and "the rotation" in result["undetermined"]
+
+
+def error_rows(result: dict[str, Any], axes: str, is_open: bool) -> Iterator[tuple[str, list[str]]]:
+    """Return label, and RMSE, median and p95 of every known error; no angles if the turn is open.
+
+    `is_open` is the result of `turn_open`.
+    """
     shown = {
         "position": f"position {axes}",
         "centre": "tags' centre",
@@ -135,15 +145,21 @@ def error_rows(result: dict[str, Any], axes: str) -> Iterator[tuple[str, int, li
     ):  # fmt: skip
         if f"{name}_rmse_{unit}" in result:
             values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
-            yield f"{shown.get(name, name)} ({unit})", places, values
+            cells = [f"{value:.{places}f}" for value in values]
+            if is_open and unit == "deg":
+                cells = ["undetermined", "", ""]
+            yield f"{shown.get(name, name)} ({unit})", cells
 
 
-def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -> None:
+def _print_errors(
+    console: Any, title: str, result: dict[str, Any], axes: str, is_open: bool
+) -> None:
     table = new_table(None, [title], ["RMSE", "median", "p95"])
-    for label, places, values in error_rows(result, axes):
-        table.add_row(label, *(f"{value:.{places}f}" for value in values))
+    for label, cells in error_rows(result, axes, is_open):
+        table.add_row(label, *cells)
     console.print(table)
-    mean = f"mean yaw error {result['yaw_mean_deg']:.2f} deg, " if "yaw_mean_deg" in result else ""
+    known = "yaw_mean_deg" in result and not is_open
+    mean = f"mean yaw error {result['yaw_mean_deg']:.2f} deg, " if known else ""
     console.print(
         f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: consistent; above: "
         "overconfident; below: too cautious)"

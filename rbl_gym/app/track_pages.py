@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 from rbl_gym.app import page, track_html
 from rbl_gym.app.consistency import consistency_parts
 from rbl_gym.app.figures import COLOURS
-from rbl_gym.app.reports import CAMSAP_COLUMNS, compared, error_rows
+from rbl_gym.app.reports import CAMSAP_COLUMNS, compared, error_rows, turn_open
 from rbl_gym.app.story import Beliefs, Story
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
@@ -155,8 +155,8 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         parts.append(page.note(f"Coordinates are relative to ({shift}) m."))
     parts.append(page.plot(track_html.track_figure(story), "track"))
     if truth is not None:
-        found = error_rows(result, result["position_axes"])
-        rows = [[label, *values] for label, _, values in found]
+        found = error_rows(result, result["position_axes"], turn_open(result))
+        rows = [[label, *cells] for label, cells in found]
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
         parts.append(
             page.note(

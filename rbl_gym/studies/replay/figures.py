@@ -10,6 +10,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import apply_alignment
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.centre import is_line
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
     as_judged,
@@ -176,8 +177,8 @@ def _notes(
         notes.append(_mirror_note(result["mirror"], count, track, told))
     known, unknown = known_figures(recording, track)
     result |= known
-    # If there is a mirror pose, its own note is sufficient.
-    notes += unknown if "mirror" not in result else []
+    # If there is a mirror pose, its own note is sufficient, except for an open turn.
+    notes += unknown if "mirror" not in result or is_line(recording.tags) else []
     volume = volume_of(recording, settings)
     if volume is not None:
         outside = int(is_outside(volume, track.translation, track.covariance).sum())
@@ -185,11 +186,25 @@ def _notes(
         if outside:
             notes.append(f"Note: the track is outside the volume in {outside} of {count} epochs.")
     if found is not None:
+        notes += _floor_note(recording, settings)
         if _truth_at_mirror(recording, track, found, settings):
             notes.append("Note: the truth is at the mirror pose.")
         else:
             notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, found, settings)]
     return {**result, "notes": notes}
+
+
+def _floor_note(recording: Recording, settings: Settings) -> list[str]:
+    """Return a hint at --planar if the truth is x, y and yaw, and no height or tilt is told."""
+    known = settings.knowledge
+    told = known.planar or known.height_std_m is not None or known.tilt_std_deg is not None
+    truth = recording.truth
+    if truth is None or truth.rotation is None or not truth.planar or told:
+        return []
+    return [
+        "Note: the truth has no height. If the body drives on a floor, give --planar --height-m H, "
+        "the height of its origin: positions become more accurate."
+    ]
 
 
 def _stamp_hints(recording: Recording, track: Track, settings: Settings) -> list[str]:
