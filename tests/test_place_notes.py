@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from rbl_gym.app import place_answer, place_figures, place_svg
 from rbl_gym.app.place_notes import deciding_notes, nees_notes, usual_notes
 from rbl_gym.placement import scene_files
+from rbl_gym.studies.placing.answer import Question, place_anchors
 from rbl_gym.studies.placing.judging import judge, short_row
 
 HALL = {
@@ -76,7 +78,7 @@ def test_a_usual_layout_that_passes_more_zones_or_has_a_much_smaller_b_is_named(
     layouts = {"designed": layout(1.2, "fail", "fail"), "grid": layout(1.0, "pass", "fail")}
     (note,) = usual_notes({"layouts": layouts})
     assert note.startswith(
-        "The usual layout 'grid' passes more zones: 1 of 2 (the designed layout: 0). If"
+        "The usual layout 'grid' passes more zones: 1 of 2 (the designed layout: 0). To"
     )
     layouts = {"designed": layout(1.2, "pass", "pass"), "ring": layout(0.12, "pass", "fail")}
     (note,) = usual_notes({"layouts": layouts})
@@ -94,3 +96,17 @@ def test_a_nees_that_is_too_large_is_told_although_the_errors_agree():
     assert note.startswith("The NEES of 'iterated EKF' is 19.94, and should be near 6")
     assert "1 % of the bodies" in note
     assert note.endswith("the NEES of the others is 6.10.")
+
+
+@pytest.mark.parametrize("survive", [0, 1])
+def test_pictures_say_which_anchors_they_assume(survive):
+    question = Question(range(4, 5), layout=ANCHORS, survive=survive, trials=20)
+    placed = place_anchors(scene_files.of_mapping(HALL), question)
+    figure = place_figures.place_figure(placed)
+    *maps, chart = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert len(maps) >= 2
+    assert all(("with all anchors present" in title) == bool(survive) for title in maps)
+    headline = place_answer.headline(placed.result)
+    for text in (figure.get_suptitle(), chart, headline):
+        assert ("with any one anchor missing" in text) == bool(survive)
+    assert ("with all anchors present" in place_svg.plan_part(placed)) == bool(survive)

@@ -219,7 +219,11 @@ def test_the_chart_says_if_the_search_was_not_for_the_margin(method, own, told):
     def row(margin):
         return {"verdict": "pass", "zones": [{"margin": margin}]}
 
-    result = row(1.2) | {"method": method, "layouts": {own: row(1.2), "ring": row(1.5)}}
+    result = row(1.2) | {
+        "survive": 0,
+        "method": method,
+        "layouts": {own: row(1.2), "ring": row(1.5)},
+    }
     axes = Figure().add_subplot()
     place_figures.draw_chart(axes, result)
     assert ("minimised b, not this margin" in axes.get_xlabel()) == told

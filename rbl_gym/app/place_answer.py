@@ -28,7 +28,8 @@ class ZoneAnswer(NamedTuple):
 
 def headline(result: dict[str, Any]) -> str:
     """Return one line: the number of anchors, and whether they suffice."""
-    count = f"{result['n_anchors']} anchors"
+    missing = ", with any one anchor missing" if result["survive"] else ""
+    count = f"{result['n_anchors']} anchors{missing}"
     zones = result["zones"]
     asked = [zone for zone in zones if zone["verdict"] != "no requirement"]
     overall = result["verdict"]
@@ -46,6 +47,11 @@ def headline(result: dict[str, Any]) -> str:
         every = "both" if met == 2 else f"all {met}"
         return f"{count}: {every} zones meet their requirements"
     return f"{count}: {met} of {len(asked)} zones meet their requirements"
+
+
+def case_of_maps(result: dict[str, Any]) -> str:
+    """Return which anchors the maps assume, if the verdict is for one anchor less; else ``""``."""
+    return "with all anchors present" if result["survive"] else ""
 
 
 def warnings(result: dict[str, Any]) -> list[str]:

@@ -93,9 +93,11 @@ def map_panel(
     """Draw one map with its title; return the labels of the anchors."""
     problem, anchors = placed.problem, placed.design.anchors
     shown = shapes.layers(problem, maps, quantity.field)
+    case = place_answer.case_of_maps(placed.result)
+    case, between = (f", {case}", "\n") if case else ("", ", ")
     if quantity.field == "relative":
         place_draw.draw_verdict(axes, shown)
-        title = "where the requirements are met"
+        title = f"where the requirements are met{case}"
         axes.legend(
             handles=place_draw.verdict_handles(shown),
             loc="lower left",
@@ -114,8 +116,8 @@ def map_panel(
             (layer.values > (getattr(layer.zone, str(quantity.limit), None) or np.inf)).any()
             for layer in shown
         )
-        title = f"error of {quantity.name} at z = {at} m"
-        axes.set_title(title + (", hatched: beyond the requirement" if limited else ""))
+        title = f"error of {quantity.name} at z = {at} m{case}"
+        axes.set_title(title + (f"{between}hatched: beyond the requirement" if limited else ""))
     place_draw.draw_building(axes, problem, anchors, names=heights)
     return place_draw.draw_anchors(axes, problem, anchors, anchor_names(placed), heights)
 
@@ -184,7 +186,8 @@ def _draw_margins(axes: Any, result: dict[str, Any]) -> None:
             "requirements."
         )
     axes.set_xlabel(label)
-    axes.set_title("margins of this layout and of the usual ones")
+    case = ", with any one anchor missing" if result["survive"] else ""
+    axes.set_title(f"margins of this layout and of the usual ones{case}")
 
 
 def _own(rows: dict[str, dict[str, Any]]) -> str:

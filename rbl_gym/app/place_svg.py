@@ -79,12 +79,15 @@ def plan_part(placed: Placed) -> str:
         f"{_building(draw, placed)}"
         "<g class='leaders' stroke='#333' vector-effect='non-scaling-stroke'></g></svg>"
     )
+    case = place_answer.case_of_maps(placed.result)
+    case = f'<p class="note">The maps show the accuracy {case}.</p>' if case else ""
     return (
         f'<figure class="plan">{_controls(panels, levels)}'
         f'<div class="stage" style="aspect-ratio: {size[0]:.1f} / {size[1]:.1f}">{svg}'
         f"{_labels(placed, edges)}</div>{_ruler(edges)}"
         f"{''.join(_scale(problem, q, ranges[q.field]) for q in panels)}"
         f'<p class="note">{html.escape(" · ".join(legend_text(problem).split("     ")))}</p>'
+        f"{case}"
         '<p class="readout">Touch the map or an anchor to see its values.</p>'
         f'<script type="application/json">{_data(placed, panels, maps, edges, middle)}</script>'
         "</figure>"
