@@ -257,6 +257,20 @@ def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way():
     assert np.square(z).sum() < 28
 
 
+@pytest.mark.parametrize("slopes", [True, False])
+def test_swapped_axes_of_the_anchors_are_refused(slopes):
+    times = 0.1 * np.arange(300)
+    ranges = ranges_of(times, np.random.default_rng(3), noise=0.08, late=0.05, planar=True)
+    recording = recording_of(times, ranges, Truth(times, *path_of(times, planar=True)))
+    settings = calibrate.LinkSettings(slopes=slopes, planar=True)
+    assert calibrate.calibrate_links(recording, settings).fit.noise_std_m.max() < 0.15
+    swapped = recording._replace(anchors=ANCHORS[:, [1, 0, 2]])
+    with pytest.raises(ValueError, match=r"ranges contradict anchors.*Check the axes"):
+        calibrate.calibrate_links(swapped, settings)
+    rough = ranges_of(times, np.random.default_rng(3), noise=0.9, planar=True)
+    calibrate.calibrate_links(recording._replace(ranges=np.maximum(rough, 0.01)), settings)
+
+
 def test_a_table_of_links_has_a_row_of_every_link_that_is_told(tmp_path):
     bias = np.array([[0.1, 0.2], [0.3, 0.4]])
     path = tmp_path / "new" / "calibration.csv"

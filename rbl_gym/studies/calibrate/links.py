@@ -32,6 +32,9 @@ __all__ = ["CalibratedLinks", "calibrate_links"]
 _UNTOLD = 0.5
 # With fewer ranges per link (median), only antenna delays of nodes are estimated.
 _FEW_RANGES = 30
+# Median noise (m) with its slow share, and median slope of the links, beyond which the geometry is
+# taken to be wrong.
+_MOST_NOISE_M, _LASTING, _MOST_SLOPE = 0.5, 0.9, 0.1
 
 
 class CalibratedLinks(NamedTuple):
@@ -113,7 +116,8 @@ def calibrate_links(
     Raises
     ------
     ValueError
-        If there is no usable truth, or no range has truth.
+        If there is no usable truth, no range has truth, or no calibration makes the ranges agree
+        with the anchors, the tags and the truth.
     """
     if isinstance(recordings, Recording):
         recordings = {"": recordings}
@@ -159,8 +163,28 @@ def calibrate_links(
         # A first harmonic as large as the others is indistinguishable from a shift of its tag.
         told = fit.tags_std_m > 0
         fit = fit._replace(tags_std_m=np.where(told, np.hypot(fit.tags_std_m, found.spread_m), 0.0))
+    _check_fit(fit)
     advance()
     return _result(log, settings, model, fit, clock, shift, found)
+
+
+def _check_fit(fit: LinkFit) -> None:
+    """Raise ValueError if the links contradict the geometry."""
+    told = fit.counts > 0
+    noise = float(np.median(fit.noise_std_m[told]))
+    # A slope counts where it is determined; half of the links, as one bad anchor is no bad table.
+    slopes = np.abs(fit.slope[told & (fit.slope_std < _UNTOLD * SLOPE)])
+    slope = float(np.median(slopes)) if len(slopes) else 0.0
+    # The noise of a poor radio is large too, but a wrong geometry leaves errors that last.
+    wrong = noise > _MOST_NOISE_M and fit.drift.share > _LASTING
+    if wrong or slope > _MOST_SLOPE:
+        raise ValueError(
+            "the ranges contradict anchors, tags and truth: after the calibration the noise of a "
+            f"range is {noise:.2g} m and the slope of a link {slope:.2g} (medians). Nothing of it "
+            "is usable, nothing is written. Check the axes (x and y swapped?), units and ids of "
+            "the anchors and the tags, the frame and heading of the truth, and its clock "
+            "(time_offset)"
+        )
 
 
 def _spans(run: Recording) -> str:
