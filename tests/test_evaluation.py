@@ -351,6 +351,7 @@ def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
     figures = tmp_path / "new" / "figures.json"
     assert main([*arguments, "--json", str(figures)]) == 0
     table = capsys.readouterr().out
+    assert "lower is better" in table
     assert json.loads(figures.read_text()) == result
     for word in (*result["methods"], "normalised: 0 is random, 1 is greedy-with-map"):
         assert word in table

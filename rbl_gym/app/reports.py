@@ -269,7 +269,9 @@ def print_evaluation(result: dict[str, Any]) -> None:
     """Print policies and references, the best first."""
     console = new_console()
     title = f"{result['task']}, {result['worlds']} held-out worlds"
-    table = new_table(title, ["policy"], ["loss", "score b (m)", "normalised", "95 %"])
+    table = new_table(
+        title, ["policy"], ["loss (lower is better)", "score b (m)", "normalised", "95 %"]
+    )
     for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
         interval = f"{row['normalised_low']:.3f} to {row['normalised_high']:.3f}"
         table.add_row(
@@ -283,7 +285,8 @@ def print_evaluation(result: dict[str, Any]) -> None:
     best, best_of = result["best_reference"], result["best_of"]
     what = f", the best of {', '.join(best_of)} in each world" if len(best_of) > 1 else ""
     scored = all(row["score_m"] is not None for row in result["methods"].values())
-    console.print(f"loss: {'the mean of log b' if scored else 'minus the mean reward'}")
+    loss = "the mean of log b, negative for b below 1 m" if scored else "minus the mean reward"
+    console.print(f"loss: {loss}")
     console.print(f"normalised: 0 is random, 1 is {best}{what}; 95 %: its confidence interval")
 
 
