@@ -28,6 +28,7 @@ from rbl_gym.estimators.level import hold_level
 from rbl_gym.estimators.linear.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.locating.doa import locate_doa
 from rbl_gym.estimators.locating.localization import PoseEstimate, locate, methods
+from rbl_gym.estimators.looped import one_by_one
 from rbl_gym.estimators.networks.consensus import (
     CycleExchange,
     cycle_consensus,
@@ -76,6 +77,7 @@ __all__ = [
     "make",
     "methods",
     "names",
+    "one_by_one",
     "orientations",
     "parse_filter",
     "register",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -123,9 +123,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         states = []
         for part in self._parts_of(moved):
             told = part.measured(observation)
-            state = part.filter.predict(
-                _rows(self._state, part.rows), told[reads(part.filter)], part.scene.dt
-            )
+            state = _rows(self._state, part.rows)
+            state = part.filter.predict(state, told[reads(part.filter)], part.scene.dt)
             states.append(update(part.filter, state, told, part.scene))
         self._put(states, moved)
 
@@ -138,11 +137,15 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self._parts = self._parted()
         states = []
         for part in self._parts_of(fresh):
-            prior = (
+            prior = [
                 info[f"prior_{key}"][part.rows] for key in ("rotation", "translation", "covariance")
-            )
-            state = part.filter.initial(*prior)
-            states.append(update(part.filter, state, part.measured(observation), part.scene))
+            ]
+            told = part.measured(observation)
+            try:
+                states.append(_begun(part, prior, told))
+            except Exception as error:
+                _check_batched(part, prior, told, error)
+                raise
         self._put(states, fresh)
 
     def _parted(self) -> list[_Part]:
@@ -173,7 +176,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         """Store the states of the parts of some worlds, and their beliefs."""
         parts = self._parts_of(where)
         rows = [part.rows for part in parts]
-        beliefs = [part.filter.belief(one) for part, one in zip(parts, states, strict=True)]
+        beliefs = [_believed(part, one) for part, one in zip(parts, states, strict=True)]
         self._state = _joined(self._state, rows, states, self.num_envs)
         self._belief = _joined(self._belief, rows, beliefs, self.num_envs)
 
@@ -247,6 +250,42 @@ class _Part(NamedTuple):
             told = {key: value[self.rows] for key, value in told.items()}
         padded = "anchor_mask" in observation and isinstance(self.scene, Scene)
         return unpadded(told, self.scene) if padded else told
+
+
+def _begun(part: _Part, prior: Sequence[FloatArray], told: Mapping[str, np.ndarray]) -> Any:
+    """Return the state of a prior after the first epoch."""
+    return update(part.filter, part.filter.initial(*prior), told, part.scene)
+
+
+def _check_batched(
+    part: _Part, prior: Sequence[FloatArray], told: Mapping[str, np.ndarray], error: Exception
+) -> None:
+    """Raise ValueError if the filter, which raised `error`, works for each world alone."""
+    try:
+        for i in range(len(part.rows)):
+            alone = {key: value[i] for key, value in told.items()}
+            part.filter.belief(_begun(part, [array[i] for array in prior], alone))
+    except Exception:
+        return
+    raise ValueError(f"{_one_body(part)}; it raised {error!r:.200}") from error
+
+
+def _believed(part: _Part, state: Any) -> PoseBelief:
+    """Return the belief of the worlds of a part; raises ValueError if it has not one for each."""
+    belief = part.filter.belief(state)
+    shape = np.shape(belief[1])
+    if shape != (len(part.rows), 3):
+        raise ValueError(f"{_one_body(part)}; its belief has a translation of shape {shape}")
+    return belief
+
+
+def _one_body(part: _Part) -> str:
+    return (
+        f"filter {type(part.filter).__name__} must accept leading batch axes, here "
+        f"({len(part.rows)},), in all its arrays, but it accepts a single body: write its formulas "
+        "for arrays (..., 3, 3), or wrap it, which loops over the worlds: "
+        "filter=rbl_gym.estimators.one_by_one(...)"
+    )
 
 
 def _takes_stacks(

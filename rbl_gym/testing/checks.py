@@ -24,10 +24,12 @@ from rbl_gym.measurements import ranging
 from rbl_gym.testing.worlds import (
     ANCHORS,
     DT,
+    FIELDS,
     NOISE,
     PROCESS,
     TAGS,
     Epochs,
+    batched,
     call,
     check_links,
     check_nees,
@@ -59,9 +61,8 @@ def check_filter(
     ----------
     make_filter
         Called as ``make_filter(tags=..., noise=..., process=...)``; the factory that is registered
-        or named by an entry point of the group ``rbl_gym.filters``. Or its path,
-        ``"module:factory"``. A filter whose attribute
-        `reads` is ``"inertial"`` gets the readings of a default `InertialSensor` instead of twists.
+        or of an entry point of ``rbl_gym.filters``; or its path ``"module:factory"``. A filter with
+        ``reads = "inertial"`` gets the readings of a default `InertialSensor` instead of twists.
     skip
         Checks to leave out, by the names below.
     seed
@@ -131,8 +132,9 @@ def _filter_interface(make_filter: Any, rng: np.random.Generator) -> None:
 def _filter_shapes(make_filter: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
         filter = _made(make_filter)
-        belief = _beliefs(filter, _drawn(filter, rng, batch, 2))[-1]
-        check_shapes("belief", belief, batch, ("rotation", "translation", "covariance", "matrix"))
+        with batched(batch):
+            belief = _beliefs(filter, _drawn(filter, rng, batch, 2))[-1]
+            check_shapes("belief", belief, batch)
 
 
 def _filter_pose(make_filter: Any, rng: np.random.Generator) -> None:
@@ -221,8 +223,7 @@ def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
     full = np.ones(ranges.shape, dtype=np.bool_)
     check_links(update, ranges)
     nothing = update(np.zeros_like(ranges), anchors, ~full)
-    before = filter.belief(state)
-    check_same("an epoch without links must not change the belief", before, nothing)
+    check_same("an epoch without links must not change the belief", filter.belief(state), nothing)
 
 
 def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
@@ -278,9 +279,8 @@ def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
     epochs = _drawn(filter, rng, (_TRIALS,), _EPOCHS)
     beliefs = _beliefs(filter, epochs)
     check_nees(beliefs, epochs.rotation, epochs.translation)
-    last = (epochs.rotation[-1], epochs.translation[-1], TAGS)
+    last, first = ((epochs.rotation[k], epochs.translation[k], TAGS) for k in (-1, 0))
     found = metrics.tag_error(beliefs[-1].rotation, beliefs[-1].translation, *last)
-    first = (epochs.rotation[0], epochs.translation[0], TAGS)
     prior = metrics.tag_error(*epochs.prior[:2], *first)
     require(
         np.median(found) < np.median(prior),
@@ -322,7 +322,7 @@ def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray | None = None) -> 
 def _locator_shapes(locate: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
         found = _located(locate, draw_epochs(rng, batch, 1).ranges[0])
-        check_shapes("estimate", found, batch, ("rotation", "translation", "covariance"))
+        check_shapes("estimate", found, batch, FIELDS)
 
 
 def _locator_pose(locate: Any, rng: np.random.Generator) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ _PRIOR_STD = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
 _SAME = 1e-6
 # Largest acceptable average NEES per degree of freedom, without any model error.
 _NEES = (1 / 3, 3.0)
-_FIELDS = ("rotation", "translation", "covariance")
+FIELDS = ("rotation", "translation", "covariance")
 
 
 class Epochs(NamedTuple):
@@ -107,6 +108,21 @@ def factory_of(make_filter: str | Callable[..., Any]) -> Callable[..., Any]:
     return imported("make_filter", make_filter)
 
 
+@contextmanager
+def batched(batch: tuple[int, ...]) -> Iterator[None]:
+    """Say in a failed check of a filter with leading axes `batch` what can be done about it."""
+    try:
+        yield
+    except AssertionError as error:
+        if not batch:
+            raise
+        raise AssertionError(
+            f"{error}. A filter must accept leading batch axes (here {batch}), and this one "
+            "accepts a single body: write its formulas for arrays (..., 3, 3), or use "
+            "rbl_gym.estimators.one_by_one(factory), which loops over the bodies"
+        ) from error
+
+
 def call(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """Return a function's result; an exception for valid arguments is a failure."""
     try:
@@ -128,7 +144,7 @@ def trial(epochs: Epochs, index: int) -> Epochs:
 
 def take(pose: Any, index: int) -> dict[str, FloatArray]:
     """Return one trial of a belief."""
-    return {name: np.asarray(getattr(pose, name))[index] for name in _FIELDS}
+    return {name: np.asarray(getattr(pose, name))[index] for name in FIELDS}
 
 
 def moved_world(rng: np.random.Generator, level: bool = False) -> tuple[FloatArray, FloatArray]:
@@ -149,7 +165,9 @@ def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArra
     }
 
 
-def check_shapes(name: str, pose: Any, batch: tuple[int, ...], fields: Sequence[str]) -> None:
+def check_shapes(
+    name: str, pose: Any, batch: tuple[int, ...], fields: Sequence[str] = (*FIELDS, "matrix")
+) -> None:
     """Check for float arrays with the shapes for leading axes `batch`."""
     cores = {"rotation": (3, 3), "translation": (3,), "covariance": (6, 6), "matrix": (3, 3)}
     for field in fields:
@@ -185,7 +203,7 @@ def check_pose(name: str, pose: Any) -> None:
 
 def check_same(rule: str, expected: Any, found: Any, tolerance: float = _SAME) -> None:
     """Check for equal pose and covariance up to a relative tolerance (0: the same bytes)."""
-    for field in _FIELDS:
+    for field in FIELDS:
         want = np.asarray(expected[field] if isinstance(expected, dict)
                           else getattr(expected, field))  # fmt: skip
         got = np.asarray(getattr(found, field))
