@@ -94,8 +94,8 @@ def test_gaps_of_the_ranges_are_counted():
         "longest_s": pytest.approx(3.2),
         "longest_at_s": pytest.approx(5.9),
     }
-    said = "Note: the log has 2 gaps without ranges; the longest lasts 3.2 s from t = 5.9 s."
-    assert said in found["notes"]
+    said = "has 2 gaps without ranges; the longest lasts 3.2 s from 5.9 s after the start."
+    assert f"Note: the log {said}" in found["notes"]
 
 
 def test_no_common_time_names_what_lies_between():

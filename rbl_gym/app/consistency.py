@@ -8,6 +8,7 @@ import numpy as np
 
 from rbl_gym.app.tables import new_table
 from rbl_gym.studies.replay import Replayed, nis_curve
+from rbl_gym.studies.replay.figures import gaps_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,13 +70,15 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     found = replayed.track.innovations
     assert found is not None
     times = replayed.track.times
-    when, ratio, low, high = nis_curve(times - times[0], found)
+    curve = nis_curve(times - times[0], found)
+    gaps = gaps_of(curve[0]) + 1
+    when, ratio, low, high = (np.insert(values, gaps, np.nan) for values in curve)
     axes.fill_between(when, low, high, color="0.85", lw=0, label="95 % of a consistent filter")
     ratio = np.clip(ratio, 1e-3, 1e6)
     axes.plot(when, ratio, color=_HONEST, lw=0.8)
     axes.axhline(1.0, color="0.5", lw=0.6)
     axes.set_yscale("log")
-    axes.set_ylim(min(0.2, ratio.min()), max(5.0, 1.1 * ratio.max()))
+    axes.set_ylim(min(0.2, np.nanmin(ratio)), max(5.0, 1.1 * np.nanmax(ratio)))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())

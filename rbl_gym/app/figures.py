@@ -18,6 +18,7 @@ from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
 from rbl_gym.studies.replay import Replayed, truth_path
+from rbl_gym.studies.replay.figures import gaps_of
 
 COLOURS = {
     "KF": "#d1495b",
@@ -291,9 +292,16 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
         align = replayed.settings.comparison.align
         label = "truth" if align == "none" else f"truth, aligned ({align})"
         axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label=label)
-    axes.plot(*track.translation[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
+    gaps = gaps_of(track.times) + 1
+
+    def cut(values: FloatArray) -> FloatArray:
+        """Break a curve of the epochs at gaps without ranges."""
+        return np.insert(values.astype(float), gaps, np.nan, axis=0)
+
+    path = cut(track.translation)
+    axes.plot(*path[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
     if replayed.smoothed is not None:
-        smoothed = replayed.smoothed.track.translation
+        smoothed = cut(replayed.smoothed.track.translation)
         axes.plot(*smoothed[:, :2].T, color=COLOURS["KF"], lw=0.8, label="smoothed")
     axes.set_aspect("equal", adjustable="box")  # datalim would cut off the label
     axes.set(xlabel="x [m]", ylabel="y [m]")
@@ -310,8 +318,8 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
                 values = errors.position
                 if row and errors.yaw is not None:
                     values = np.rad2deg(errors.yaw)
-                times = track.times[errors.known] - track.times[0]
-                axes.plot(times, values[errors.known], color=COLOURS[colour], lw=0.8)
+                known, times = cut(errors.known) != 0, cut(track.times - track.times[0])
+                axes.plot(times[known], cut(values)[known], color=COLOURS[colour], lw=0.8)
         axes.set(xlabel="time since the start [s]", ylabel=label)
         axes.grid(True)
     if track.innovations is not None:

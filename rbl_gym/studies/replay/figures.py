@@ -118,11 +118,16 @@ def _comparison(recording: Recording, found: TrackErrors, settings: Settings) ->
     return result
 
 
-def _gaps(times: FloatArray) -> dict[str, Any]:
-    """Return the number of gaps without ranges, and length and start of the longest."""
+def gaps_of(times: FloatArray) -> np.ndarray:
+    """Return the indices of the last epochs before gaps without ranges."""
     steps = np.diff(times)
     shortest = max(_GAP_S, _GAP_STEPS * float(np.median(steps))) if len(steps) else _GAP_S
-    gaps = np.flatnonzero(steps > shortest)
+    return np.flatnonzero(steps > shortest)
+
+
+def _gaps(times: FloatArray) -> dict[str, Any]:
+    """Return the number of gaps without ranges, and length and start of the longest."""
+    steps, gaps = np.diff(times), gaps_of(times)
     if not len(gaps):
         return {"count": 0, "longest_s": None, "longest_at_s": None}
     longest = gaps[steps[gaps].argmax()]
@@ -133,14 +138,15 @@ def _gaps(times: FloatArray) -> dict[str, Any]:
     }
 
 
-def _gap_note(gaps: dict[str, Any]) -> list[str]:
+def _gap_note(times: FloatArray) -> list[str]:
+    gaps = _gaps(times)
     count = gaps["count"]
     if not count:
         return []
     what = "a gap without ranges; it" if count == 1 else f"{count} gaps without ranges; the longest"
     return [
         f"Note: the log has {what} lasts {gaps['longest_s']:.1f} s from "
-        f"t = {gaps['longest_at_s']:.10g} s."
+        f"{gaps['longest_at_s'] - times[0]:.1f} s after the start."
     ]
 
 
@@ -163,7 +169,7 @@ def _notes(
     """Return the figures of the mirror pose and of known directions, and notes for the reader."""
     result: dict[str, Any] = {}
     notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
-    notes += _gap_note(_gaps(track.times))
+    notes += _gap_note(track.times)
     count = len(track.times)
     if track.other is not None and np.isfinite(track.other.log_odds[-1]):
         alive = track.other.alive
