@@ -211,3 +211,21 @@ def test_ranges_that_a_set_has_calibrated(monkeypatch):
     np.testing.assert_allclose(log.ranges[0].max(), 1.74375)
     np.testing.assert_allclose(log.range_std[0].max(), 0.11086)
     assert log.report.notes == ("uwb.csv: columns not read: range.",)
+
+
+def test_a_table_of_calibrate_takes_the_columns_of_the_users_own_table(tmp_path):
+    rows = [("A", "p", 3.0), ("B", "p", 4.0)]
+    (tmp_path / "ranges.csv").write_text(table("t,anchor,tag,range", [(0, *row) for row in rows]))
+    (tmp_path / "anchors.csv").write_text(points("anchor", "AB", ANCHORS[:2]))
+    own = {"tags.tag": "addr", "tags.x": "bx_mm", "tags.y": "by_mm", "tags.z": "bz_mm"}
+    files = Files(*(str(tmp_path / f"{name}.csv") for name in ("ranges", "anchors", "tags")))
+    for text in ("addr,bx_mm,by_mm,bz_mm\np,300,-200,50\n", "tag,x,y,z\np,0.3,-0.2,0.05\n"):
+        (tmp_path / "tags.csv").write_text(text)
+        read = read_recording(files, format=Format(columns=own))
+        np.testing.assert_allclose(read.tags, [[0.3, -0.2, 0.05]])
+    # Names that the table has are taken, also if they exchange the axes.
+    read = read_recording(files, format=Format(columns={"tags.x": "y", "tags.y": "x"}))
+    np.testing.assert_allclose(read.tags, [[-0.2, 0.3, 0.05]])
+    (tmp_path / "tags.csv").write_text("tag,x,y,z,w\np,0.3,-0.2,0.05,0\n")
+    with pytest.raises(ValueError, match="missing column"):
+        read_recording(files, format=Format(columns=own))

@@ -294,6 +294,9 @@ def _roles(
     """Return the names in the file by the content of the columns, in the order of the file."""
     if "time" in columns:
         columns["t"] = columns.pop("time")
+    standard = source.file in ("anchors", "tags") and {*header} <= {source.file[:-1], *"xyz"}
+    if standard and {*columns} <= {*header} and not {*columns.values()} & {*header}:
+        columns = {}  # a file of `rbl-gym calibrate`, with the options for the user's own file
     names: dict[str, str] = {}
     pattern = columns.pop("*", None)
     if pattern is not None:
