@@ -271,6 +271,21 @@ def test_swapped_axes_of_the_anchors_are_refused(slopes):
     calibrate.calibrate_links(recording._replace(ranges=np.maximum(rough, 0.01)), settings)
 
 
+def test_a_truth_without_heights_needs_the_height_of_the_body():
+    times = 0.1 * np.arange(300)
+    ranges = ranges_of(times, np.random.default_rng(4), planar=True)
+    rotation, place = path_of(times, planar=True)
+    truth = Truth(times, rotation, place * [1, 1, 0], planar=True)
+    recording = recording_of(times, ranges, truth)
+    found = calibrate.calibrate_links(recording, calibrate.LinkSettings(planar=True, height_m=1.0))
+    assert np.median(found.fit.noise_std_m) == pytest.approx(0.05, rel=0.1)
+    np.testing.assert_allclose(found.fit.bias_m, 0, atol=0.06)
+    with pytest.raises(ValueError, match="height_m or height_offset_m must be given"):
+        calibrate.calibrate_links(recording, calibrate.LinkSettings(planar=True))
+    with pytest.raises(ValueError, match="height_m must be left out"):
+        calibrate.LinkSettings(height_m=1.0, height_offset_m=0.5)
+
+
 def test_a_table_of_links_has_a_row_of_every_link_that_is_told(tmp_path):
     bias = np.array([[0.1, 0.2], [0.3, 0.4]])
     path = tmp_path / "new" / "calibration.csv"

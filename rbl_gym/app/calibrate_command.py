@@ -103,8 +103,14 @@ def _add_plane(group: Any) -> None:
         metavar="X",
         help=(
             "depth of the tags below the anchors (difference of the mean heights), metres; "
-            "needed if the truth has no heights"
+            "if the truth has no heights, this or --height-m is needed"
         ),
+    )
+    group.add_argument(
+        "--height-m",
+        type=float,
+        metavar="X",
+        help="with --truth: height of the body's origin, metres, if the truth has no heights",
     )
 
 
@@ -167,6 +173,7 @@ _WITH_TRUTH = {
     "tags_model": "--arms",
     "harmonics": "--harmonics",
     "ends": "--ends",
+    "height_m": "--height-m",
     "time_offset": "--time-offset",
     "truth_gap_s": "--truth-gap-s",
     "truth_exclude": "--truth-exclude",

@@ -64,12 +64,13 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
             )
         if run.truth.planar and not settings.planar:
             raise ValueError(f"{label}the truth has no heights: set planar")
-        if run.truth.planar and settings.height_offset_m is None:
+        if run.truth.planar and settings.height_offset_m is None and settings.height_m is None:
             heights = run.anchors[..., 2]
             if np.ptp(heights) > 0.1:
                 raise ValueError(
-                    f"{label}height_offset_m must be given: the truth has no heights, and the "
-                    f"anchors are at heights of {heights.min():g} to {heights.max():g} m"
+                    f"{label}height_m or height_offset_m must be given: the truth has no "
+                    f"heights, and the anchors are at heights of "
+                    f"{heights.min():g} to {heights.max():g} m"
                 )
     times = np.concatenate([run.times for run in runs])
     out = np.zeros(len(times), dtype=bool)
@@ -101,7 +102,8 @@ def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, 
         if truth.planar:
             p = p.copy()
             offset = settings.height_offset_m or 0.0
-            p[:, 2] = run.anchors_by_epoch[..., 2].mean(axis=-1) - offset - log.tags[:, 2].mean()
+            below = run.anchors_by_epoch[..., 2].mean(axis=-1) - offset - log.tags[:, 2].mean()
+            p[:, 2] = below if settings.height_m is None else settings.height_m
         rotation.append(Q)
         translation.append(p)
         known.append(ok)

@@ -33,6 +33,8 @@ class LinkSettings:
         of tags are fixed.
     height_offset_m
         Mean height of the anchors minus that of the tags, if the truth has no height.
+    height_m
+        Height of the body's origin, if the truth has no height; instead of `height_offset_m`.
     time_offset
         How far the clock of the truth is ahead of that of the ranges, seconds; ``"auto"``:
         estimated.
@@ -49,6 +51,7 @@ class LinkSettings:
     ends: str = "tags"
     planar: bool = False
     height_offset_m: float | None = None
+    height_m: float | None = None
     time_offset: float | str = "auto"
     truth_gap_s: float = 0.5
     truth_exclude: tuple[tuple[float, float], ...] = ()
@@ -59,8 +62,11 @@ class LinkSettings:
         check_count("harmonics", self.harmonics, least=0, most=8)
         check_one_of("ends", self.ends, ("tags", "both"))
         check_number("truth_gap_s", self.truth_gap_s, low=0.0)
-        if self.height_offset_m is not None:
-            check_number("height_offset_m", self.height_offset_m)
+        for name in ("height_offset_m", "height_m"):
+            if (value := getattr(self, name)) is not None:
+                check_number(name, value)
+        if self.height_offset_m is not None and self.height_m is not None:
+            raise ValueError("height_m must be left out with height_offset_m: give one of them")
         if self.time_offset != "auto":
             check_number("time_offset", self.time_offset)
         for window in self.truth_exclude:
