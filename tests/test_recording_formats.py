@@ -191,7 +191,8 @@ def test_unit_of_time_in_the_header(tmp_path):
         text = many(5, 1.0).replace("t,", f"{head},", 1)
         log = read(tmp_path, text)
         np.testing.assert_allclose(log.times, 1e-3 * np.arange(5))
-        assert log.report.notes == ()
+        (note,) = log.report.notes
+        assert note.endswith("times are in ms, as the header states.")
     for micro in ("u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"):
         log = read(tmp_path, many(5, 1000.0).replace("t,", f"t [{micro}s],", 1))
         np.testing.assert_allclose(log.times, 1e-3 * np.arange(5))

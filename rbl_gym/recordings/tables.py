@@ -173,6 +173,8 @@ class Table(NamedTuple):
         values, note = self.numbers("t"), ""
         if said is None:
             said, note = found_unit(values)
+        elif unit is None and said != "s":
+            note = f"times are in {said}, as the header states"
         times = values * seconds_per(said)
         too_late = f"must be at most {MAX_TIME_S:g} s (looks like milliseconds?)"
         self.check(np.abs(times) <= MAX_TIME_S, "t", too_late)
