@@ -12,6 +12,8 @@ from rbl_gym.app.figures import ellipse, new_figure, styled
 from rbl_gym.studies.calibrate import CalibratedLinks, SurveyedAnchors
 
 _MOST_POINTS = 20_000
+# Letters and spaces of the labels that fit below a panel side by side.
+_LABEL_LETTERS = 60
 
 
 @styled
@@ -42,7 +44,8 @@ def _anchors_figure(found: SurveyedAnchors) -> Figure:
     by_anchor = [e[:, m][e[:, m] != 0] for m in range(len(found.anchor_ids))]
     if any(len(values) for values in by_anchor):
         right.boxplot(by_anchor, showfliers=False, whis=(2.5, 97.5))
-        right.set_xticks(range(1, len(by_anchor) + 1), found.anchor_ids)
+        ticks = range(1, len(by_anchor) + 1)
+        right.set_xticks(ticks, found.anchor_ids, **_turned(found.anchor_ids))
     right.axhline(0, color="0.4", lw=0.6)
     right.set(xlabel="anchor", ylabel="residual [m]: quartiles, 95 %")
     right.grid(True)
@@ -66,6 +69,13 @@ def _links_figure(found: CalibratedLinks) -> Figure:
     return figure
 
 
+def _turned(labels: tuple[str, ...]) -> dict[str, Any]:
+    """Return how labels below an axis are drawn: turned if together they are too long for it."""
+    if sum(len(label) + 2 for label in labels) <= _LABEL_LETTERS:
+        return {}
+    return {"rotation": 30, "ha": "right", "rotation_mode": "anchor", "fontsize": 7}
+
+
 def _biases(axes: Any, found: CalibratedLinks) -> None:
     fit = found.fit
     for n, tag in enumerate(found.tag_ids):
@@ -74,7 +84,7 @@ def _biases(axes: Any, found: CalibratedLinks) -> None:
         axes.errorbar(
             at[told], fit.bias_m[told, n], 2 * fit.bias_std_m[told, n], fmt="o", ms=4, label=tag
         )
-    axes.set_xticks(range(len(found.anchor_ids)), found.anchor_ids)
+    axes.set_xticks(range(len(found.anchor_ids)), found.anchor_ids, **_turned(found.anchor_ids))
     axes.set(xlabel="anchor", ylabel="bias [m], 2 standard deviations")
     axes.grid(True)
     if len(found.tag_ids) <= 12:

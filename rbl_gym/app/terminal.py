@@ -97,7 +97,11 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
                 shown = now
                 bar.update(task, completed=done, total=total)
 
-        yield advance
+        try:
+            yield advance
+        except BaseException:
+            bar.live.transient = True  # no unfinished bar above the error
+            raise
         bar.update(task, completed=done, total=total)
 
 
