@@ -214,12 +214,16 @@ def parse_filter(text: Any, options: Mapping[str, Any] | None = None) -> tuple[A
 _PYTHON = {"True": "true", "False": "false", "None": "null"}
 
 
-def filter_text(name: str, options: Mapping[str, Any]) -> str:
-    """Return the text of a filter with options; `parse_filter` reads it if they are JSON-able."""
+def filter_text(name: str | Callable[..., Filter], options: Mapping[str, Any]) -> str:
+    """Return the text of a filter with options; `parse_filter` reads it if they are JSON-able.
+
+    The text of a class or function, which `parse_filter` does not read, begins with its own name.
+    """
+    text = name if isinstance(name, str) else getattr(name, "__name__", repr(name))
     values = {
         key: x if isinstance(x, str) else json.dumps(x, default=str) for key, x in options.items()
     }
-    return "/".join((name, *(f"{key}={value}" for key, value in values.items())))
+    return "/".join((text, *(f"{key}={value}" for key, value in values.items())))
 
 
 def factory_of(name: str | Callable[..., Filter]) -> Callable[..., Filter]:

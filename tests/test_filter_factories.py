@@ -11,6 +11,7 @@ import pytest
 
 from rbl_gym import estimators
 from rbl_gym.estimators import IteratedEkf
+from rbl_gym.studies.watching.played import own_filter
 from rbl_gym.testing import check_filter
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
@@ -85,3 +86,10 @@ def test_wrong_factories_are_named():
         scalar(in_notebook(), options={"iteration": 2})
     with pytest.raises(ValueError, match="or a class or function that makes the filter, got 3"):
         scalar(3)
+
+
+def test_the_studio_names_a_filter_by_its_class():
+    env: Any = EstimatePose(gym.make(ID, scene=short("hall", 4)), once, {})
+    found = own_filter(env)
+    assert found is not None
+    assert (found.label, found.name) == ("once", once)

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("shapely", reason="needs the extra placement")
+
 from rbl_gym.app import place_answer, place_figures, place_svg
 from rbl_gym.app.place_notes import deciding_notes, nees_notes, usual_notes
 from rbl_gym.placement import scene_files

@@ -218,7 +218,10 @@ def test_a_table_of_calibrate_takes_the_columns_of_the_users_own_table(tmp_path)
     (tmp_path / "ranges.csv").write_text(table("t,anchor,tag,range", [(0, *row) for row in rows]))
     (tmp_path / "anchors.csv").write_text(points("anchor", "AB", ANCHORS[:2]))
     own = {"tags.tag": "addr", "tags.x": "bx_mm", "tags.y": "by_mm", "tags.z": "bz_mm"}
-    files = Files(*(str(tmp_path / f"{name}.csv") for name in ("ranges", "anchors", "tags")))
+    ranges, anchors, tags = (
+        str(tmp_path / f"{name}.csv") for name in ("ranges", "anchors", "tags")
+    )
+    files = Files(ranges, anchors, tags)
     for text in ("addr,bx_mm,by_mm,bz_mm\np,300,-200,50\n", "tag,x,y,z\np,0.3,-0.2,0.05\n"):
         (tmp_path / "tags.csv").write_text(text)
         read = read_recording(files, format=Format(columns=own))

@@ -17,7 +17,7 @@ from rbl_gym.envs.placement_family import PlacementFamilyEnv, PlacementFamilyVec
 from rbl_gym.estimators import Filter
 from rbl_gym.estimators.filter import check_takes_noise, reads
 from rbl_gym.placement import Context, PlacementTask
-from rbl_gym.wrappers.estimate import FilterLike, make_filter, named_filter
+from rbl_gym.wrappers.estimate import FilterLike, FilterName, make_filter, named_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
 
 REWARDS = ("bound", "filter")
@@ -29,7 +29,7 @@ _REWARD_ADVICE = (
 _TOLD = ("region", "racks", "anchors", "rack_mask", "anchor_mask")
 
 
-def filter_of(env: Any, task: PlacementTask, name: str, options: Any) -> Filter:
+def filter_of(env: Any, task: PlacementTask, name: FilterName, options: Any) -> Filter:
     """Return the filter of a task; raises ValueError if it does not suit the scene."""
     filter = make_filter(env, task.scene, name, options)
     if reads(filter) != "twist":

@@ -202,7 +202,7 @@ def follow(
         yield filter.belief(state)
 
 
-def check_determined(task: PlacementTask, name: str, filter: Filter) -> None:
+def check_determined(task: PlacementTask, name: object, filter: Filter) -> None:
     """Raise ValueError if no layout lets the filter find the pose without the prior.
 
     The filter follows the tracks through the whole volume, without racks, on random layouts. It

@@ -119,6 +119,7 @@ def _refined(changes: _Changes, start: float, moves: FloatArray) -> Clock | None
     std = float(robust.spread(changes.left(start)[0], known, _LEAST_M))
     moved = changes.of(moves)[known] / std
     offset, move = start, np.zeros(moved.shape[-1])
+    z = share = own = rate = np.empty(0)  # of the last step
     for _ in range(_STEPS):
         z = changes.left(offset)[0][known] / std - moved @ move
         rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]

@@ -78,7 +78,7 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     axes.plot(when, ratio, color=_HONEST, lw=0.8)
     axes.axhline(1.0, color="0.5", lw=0.6)
     axes.set_yscale("log")
-    axes.set_ylim(min(0.2, np.nanmin(ratio)), max(5.0, 1.1 * np.nanmax(ratio)))
+    axes.set_ylim(min(0.2, float(np.nanmin(ratio))), max(5.0, 1.1 * float(np.nanmax(ratio))))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())

@@ -294,7 +294,7 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
         axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label=label)
     gaps = gaps_of(track.times) + 1
 
-    def cut(values: FloatArray) -> FloatArray:
+    def cut(values: np.ndarray) -> FloatArray:
         """Break a curve of the epochs at gaps without ranges."""
         return np.insert(values.astype(float), gaps, np.nan, axis=0)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -120,7 +120,7 @@ class Named(NamedTuple):
     """A filter by its name in `rbl_gym.estimators`, with its options, and a label."""
 
     label: str
-    name: str
+    name: str | Callable[..., Filter]
     options: dict[str, Any]
 
 
