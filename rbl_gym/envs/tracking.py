@@ -22,7 +22,7 @@ from rbl_gym.worlds.scene import Scene
 REWARDS = ("bound", "none")
 REWARD_ADVICE = (
     "for other rewards, or a function, wrap the environment: EstimatePose(env, filter, reward=...)"
-    ", or VectorEstimatePose, from rbl_gym.wrappers"
+    ", or VectorEstimatePose (docs/environments/wrappers.md)"
 )
 # Bound of the observations of a family, whose scenes have different bounds.
 _FAR = 1e9

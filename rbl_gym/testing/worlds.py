@@ -103,7 +103,7 @@ def factory_of(make_filter: str | Callable[..., Any]) -> Callable[..., Any]:
     if ":" not in make_filter:
         raise ValueError(
             "make_filter must be a class, a function or 'module:factory'; for a filter with a name "
-            f"write functools.partial(rbl_gym.estimators.make, {make_filter!r:.80})"
+            f"write functools.partial(estimators.make, {make_filter!r:.80})"
         )
     return imported("make_filter", make_filter)
 
