@@ -130,17 +130,6 @@ def multiply(A: Any, B: Any, out: Any) -> None:
 
 
 @helper
-def multiply_transposed(A: Any, B: Any, out: Any) -> None:
-    """Compute ``out = A B^T`` of matrices; `out` is neither of them."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[0]):
-            total = 0.0
-            for k in range(A.shape[1]):
-                total += A[i, k] * B[j, k]
-            out[i, j] = total
-
-
-@helper
 def fill(value: float, out: Any) -> None:
     """Set ``out[:] = value`` of a matrix; numba takes a second to compile the slice."""
     for i in range(out.shape[0]):
