@@ -1,5 +1,6 @@
 """Settings of all tests."""
 
+import logging
 from collections import defaultdict
 
 import pytest
@@ -10,6 +11,10 @@ from rbl_gym import kernels
 # The same examples at every run: a failure is a fact, not a lottery.
 settings.register_profile("rbl", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("rbl")
+
+
+# Tests read what commands print. Whether kernels were on disk must not change it.
+logging.getLogger("rbl_gym.kernels").setLevel(logging.WARNING)
 
 
 def pytest_addoption(parser):

@@ -53,6 +53,29 @@ def test_a_call_runs_the_kernel_and_broadcasts(kernel_of_half):
     assert half.__doc__ == "Half of x (...)."
 
 
+@needs_numba
+def test_the_command_line_says_once_that_kernels_compile(capsys, caplog, monkeypatch):
+    from rbl_gym.app.cli import main
+    from rbl_gym.kernels import jit
+
+    caplog.set_level("INFO", "rbl_gym.kernels")
+    monkeypatch.setattr(jit, "_KEPT", False)
+    with pytest.raises(SystemExit, match="0"):
+        main(["--version"])
+    capsys.readouterr()
+    jit._announce.cache_clear()
+
+    def double(x, out):
+        out[0] = 2 * x
+
+    for _ in range(2):
+        assert jit.gufunc("()->()")(double).build()(1.0) == 2.0
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert line.startswith("rbl-gym: compiling kernels, once after an installation")
+
+
 def test_without_kernels_the_textbook_form_runs(monkeypatch):
     monkeypatch.setattr(kernels, "enabled", lambda: False)
     monkeypatch.setattr(half, "_run", None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -59,6 +60,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
+class _ToStderr(logging.Handler):
+    """Print messages to the standard error of the moment, above a progress bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"rbl-gym: {record.getMessage()}", file=sys.stderr, flush=True)
+
+
+def _show_log() -> None:
+    """Show messages of the package, such as that kernels are compiled."""
+    log = logging.getLogger("rbl_gym")
+    log.setLevel(logging.INFO)
+    if not log.handlers:
+        log.addHandler(_ToStderr())
+
+
 def _flush() -> None:
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
@@ -67,6 +83,7 @@ def _flush() -> None:
 
 def _run(arguments: Sequence[str] | None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
+    _show_log()
     parser = _parser(*arguments[:1])
     options = parser.parse_args(arguments)
     if options.command is None:

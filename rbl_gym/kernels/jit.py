@@ -9,11 +9,13 @@ import contextlib
 import functools
 import gc
 import hashlib
+import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
 from rbl_gym.kernels.helper_code import FUSED, as_code, compile_helper, types_remembered
 
@@ -26,6 +28,23 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _FOLDER = Path(__file__).parent
 _TYPES = {"f": numba.float64, "i": numba.int64, "b": numba.boolean}
+_LOG = logging.getLogger("rbl_gym.kernels")
+
+
+@functools.cache
+def _announce() -> None:
+    """Log, once in a process, that kernels compile."""
+    _LOG.info("compiling kernels, once after an installation; this can take a minute")
+
+
+class _Passes(event.Listener):
+    """Listener to the passes of the compiler. Loading a kernel from disk runs none."""
+
+    def on_start(self, event: Any) -> None:
+        _announce()
+
+    def on_end(self, event: Any) -> None:
+        pass
 
 
 def contents_hash(folder: Path) -> str:
@@ -120,7 +139,7 @@ def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any,
     second step is optimized.
     """
     made: Any = numba.guvectorize(signature, cache=_KEPT, fastmath=FUSED)(function)
-    with as_code():
+    with as_code(), event.install_listener("numba:run_pass", _Passes()):
         made.add(arguments)
     made.disable_compile()
     return made.build_ufunc()
