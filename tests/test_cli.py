@@ -381,7 +381,9 @@ def test_a_missing_extra_is_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     page = str(tmp_path / "x.html")
     assert main(["demo", "--trials", "2", "--html", page]) == 2
-    assert "pip install 'rbl-gym[viz]'" in capsys.readouterr().err
+    assert capsys.readouterr().err == (
+        "rbl-gym demo: --html needs the extra viz: pip install 'rbl-gym[viz]'\n"
+    )
 
 
 @pytest.mark.parametrize("bad", [["--trials", "0"], ["--trials", "x"], ["--seed", "-1"]])

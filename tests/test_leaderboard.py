@@ -19,7 +19,7 @@ from rbl_gym.estimators import filter as belief
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Files, read_recording
-from rbl_gym.studies import extras, monte_carlo, replay
+from rbl_gym.studies import monte_carlo, replay
 from rbl_gym.studies.bench import figures as bench_figures
 from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.bench import worlds as bench_worlds
@@ -459,13 +459,13 @@ def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
 
 
 def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys, monkeypatch):
-    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     status, data = bench(tmp_path, "--scenes", short, "--jobs", "2")
     assert (status, data) == (2, b"")
     (line,) = capsys.readouterr().err.splitlines()
     assert line == (
-        "rbl-gym: this command needs the extra parallel: pip install 'rbl-gym[parallel]', or leave "
-        "out --jobs"
+        "rbl-gym bench: running in several processes needs the extra parallel: pip install "
+        "'rbl-gym[parallel]', or leave out --jobs"
     )
 
 

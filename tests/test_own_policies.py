@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rbl_gym.app.cli import main
-from rbl_gym.studies.extras import MissingExtraError
+from rbl_gym.extras import MissingExtraError
 from rbl_gym.studies.learning import own_policies, policies, training
 from rbl_gym.studies.learning.evaluation import evaluate
 from rbl_gym.studies.learning.own_policies import OwnPolicy, policies_by_label, policy_like
@@ -146,7 +146,7 @@ def test_what_is_no_task_is_named(make, message):
 
 
 def test_a_missing_library_is_named_before_a_training_begins(monkeypatch, capsys):
-    def missing(module, extra):
+    def missing(module, extra, what):
         raise MissingExtraError(f"needs {module}, extra {extra}")
 
     monkeypatch.setattr(training, "require", missing)
@@ -154,7 +154,7 @@ def test_a_missing_library_is_named_before_a_training_begins(monkeypatch, capsys
         training.check_training(rl_task("halls"), 0)
     assert main(["train", "halls"]) == 2
     # No progress bar before it.
-    assert capsys.readouterr().err == "rbl-gym: needs torch, extra rl\n"
+    assert capsys.readouterr().err == "rbl-gym train: needs torch, extra rl\n"
 
 
 @needs("torch", "stable_baselines3")

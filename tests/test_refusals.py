@@ -13,6 +13,7 @@ from rbl_gym.app import terminal
 from rbl_gym.bounds import links as link_bounds
 from rbl_gym.checks import as_tuples
 from rbl_gym.geometry import bodies
+from rbl_gym.geometry.regions import Box
 from rbl_gym.measurements import ranging
 from rbl_gym.networks import rigidity
 from rbl_gym.placement import design, scene_files
@@ -180,6 +181,13 @@ def test_directions_of_length_zero():
     [
         ({"start_volume": [1, 2, 3]}, "start_volume must be a Box or None"),
         (
+            {"start_volume": {"low": [0, 0, 0]}},
+            "scene.start_volume must have the field 'high'",
+        ),
+        ({"start_volume": {"kind": "shell"}}, "scene.start_volume.kind must be one of 'box'"),
+        ({"start_rotation": {"yaw": 1}}, "scene.start_rotation must be one value, got the dict"),
+        ({"dt": {"kind": "box"}}, "scene.dt must be one value, got the dict"),
+        (
             {"trajectory": "orbit", "volume": {"kind": "box", "low": [1, 1, 1], "high": [1, 3, 3]}},
             "volume must have an extent in x and y for 'orbit'",
         ),
@@ -188,6 +196,15 @@ def test_directions_of_length_zero():
 def test_scenes(changes, message):
     with pytest.raises(ValueError, match=message):
         scenes.get({"name": "uwb_room", **changes})
+
+
+def test_a_start_volume_is_a_dict_of_two_corners():
+    corners = {"low": [0, 0, 1], "high": [1, 1, 2]}
+    found = [
+        scenes.get({"name": "uwb_room", "start_volume": {**kind, **corners}}).start_volume
+        for kind in ({}, {"kind": "box"})
+    ]
+    assert found == [Box((0, 0, 1), (1, 1, 2))] * 2
 
 
 def test_replays():

@@ -145,7 +145,7 @@ def test_the_worlds_of_the_task_are_not_kept():
 def test_a_policy_keeps_families_of_scenes(monkeypatch, tmp_path, capsys):
     file = tmp_path / "halls.json"
     file.write_text(json.dumps([{"name": "hall", "steps": 2}]))
-    path = trained(monkeypatch, tmp_path, "--scenes", str(file))
+    path = trained(monkeypatch, tmp_path, "--family", str(file))
     assert policies.load(path).meta["scenes"] == [{"name": "hall", "steps": 2}]
     assert played(capsys, path) == "selection in the scene of the training"
 

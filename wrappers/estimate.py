@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv
 
 from rbl_gym import estimators, metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray
@@ -20,6 +19,7 @@ from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise
 from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes
+from rbl_gym.wrappers.forms import check_single
 from rbl_gym.wrappers.observations import Seen, ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
@@ -93,11 +93,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(
             self, filter=filter, options=options, reward=reward, observation=observation
         )
-        if isinstance(env, VectorEnv):
-            raise ValueError(
-                f"env must be one environment, got the vector environment {env}: use "
-                "VectorEstimatePose"
-            )
+        check_single(env, "VectorEstimatePose")
         gym.Wrapper.__init__(self, env)
         self._scene = scene_of(env)
         self._reward = reward_of(reward)

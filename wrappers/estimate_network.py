@@ -26,6 +26,7 @@ from rbl_gym.networks.bounds import Sensing
 from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import tell
 from rbl_gym.rendering.network import Headings
+from rbl_gym.wrappers.forms import check_single, check_vector
 
 REWARDS = ("belief", "error")
 # Separates the wrapper's random numbers from those of the environment with the same seed.
@@ -105,6 +106,7 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(
             self, reward=reward, cycles=cycles, kappa=kappa, order=order, steps=steps
         )
+        check_single(env, "VectorEstimateNetwork")
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.unwrapped, PlanarNetworkEnv):
             raise ValueError(f"env must be RBL/PlanarNetwork-v0, got {env.unwrapped}")
@@ -170,6 +172,7 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(
             self, reward=reward, cycles=cycles, kappa=kappa, order=order, steps=steps
         )
+        check_vector(env, "EstimateNetwork")
         VectorWrapper.__init__(self, env)
         if not isinstance(env.unwrapped, PlanarNetworkVectorEnv):
             raise ValueError(f"env must be RBL/PlanarNetwork-v0, got {env.unwrapped}")

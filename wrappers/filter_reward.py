@@ -19,6 +19,7 @@ from rbl_gym.estimators.filter import check_takes_noise, reads
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.wrappers.estimate import FilterLike, FilterName, make_filter, named_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
+from rbl_gym.wrappers.forms import check_single, check_vector
 
 REWARDS = ("bound", "filter")
 _REWARD_ADVICE = (
@@ -127,6 +128,7 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, filter=filter, options=options)
+        check_single(env, "VectorFilterReward")
         gym.Wrapper.__init__(self, env)
         self._judge = _Judge(env, filter, options)
 
@@ -158,6 +160,7 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, filter=filter, options=options)
+        check_vector(env, "FilterReward")
         VectorWrapper.__init__(self, env)
         self._judge = _Judge(env, filter, options)
         self._error_m = np.zeros(env.num_envs)

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices  # pyright: ignore[reportMissingImports]
+
+from rbl_gym.extras import require
+
+require("stable_baselines3", "rl", "Sb3VecEnv")
+from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
+    VecEnv,  # pyright: ignore[reportMissingImports]
+    VecEnvIndices,
+)
 
 __all__ = ["Sb3VecEnv"]
 

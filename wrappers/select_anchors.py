@@ -16,6 +16,7 @@ from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import check_actions
 from rbl_gym.wrappers.estimate import scene_of
+from rbl_gym.wrappers.forms import check_single, check_vector
 
 # Age of an unknown quality, in steps.
 _NEVER = 1e6
@@ -56,6 +57,7 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def __init__(self, env: gym.Env[Any, Any], memory: bool = False) -> None:
         RecordConstructorArgs.__init__(self, memory=memory)
+        check_single(env, "VectorSelectAnchors")
         gym.Wrapper.__init__(self, env)
         scene_of(env)
         self._n_anchors = env.observation_space["links"].shape[0]  # pyright: ignore[reportIndexIssue]
@@ -95,6 +97,7 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], memory: bool = False) -> None:
         RecordConstructorArgs.__init__(self, memory=memory)
+        check_vector(env, "SelectAnchors")
         VectorWrapper.__init__(self, env)
         scene_of(env)
         self._shape = env.num_envs, env.single_observation_space["links"].shape[0]  # pyright: ignore[reportIndexIssue]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
@@ -28,6 +27,7 @@ from rbl_gym.wrappers.estimate import (
     update,
     with_bound,
 )
+from rbl_gym.wrappers.forms import check_vector
 from rbl_gym.wrappers.observations import Seen, ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
@@ -62,11 +62,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(
             self, filter=filter, options=options, reward=reward, observation=observation
         )
-        if isinstance(env, gym.Env):
-            raise ValueError(
-                f"env must be a vector environment, got the single environment {env}: use "
-                "EstimatePose"
-            )
+        check_vector(env, "EstimatePose")
         VectorWrapper.__init__(self, env)
         self._scene: Any = scene_of(env)
         self._named = named_filter(filter, options)

@@ -13,7 +13,6 @@ from gymnasium.error import Error as GymError
 
 from rbl_gym import __version__
 from rbl_gym.app.parser import Parser, with_options
-from rbl_gym.studies.extras import MissingExtraError
 
 # The commands and the module of `rbl_gym.app` with the function `add_NAME` of each, in the order of
 # the help.
@@ -96,8 +95,6 @@ def _run(arguments: Sequence[str] | None) -> int:
         status = options.run(options)
         _flush()
         return status
-    except MissingExtraError as error:
-        print(f"rbl-gym: {error}", file=sys.stderr)
     except BrokenPipeError:
         raise
     except OSError as error:

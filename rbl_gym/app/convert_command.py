@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from rbl_gym.app.terminal import add_json, progress, write_json
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 
 _KINDS = {
     "ranges": "topic and fields, as in topic=/uwb,anchor=to,tag=from,range=distance; further keys: "
@@ -64,7 +64,7 @@ def add_convert(commands: Any) -> None:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    require("rosbags", "bags")
+    require("rosbags", "bags", "reading bags")
     from rbl_gym.app import convert_report
     from rbl_gym.recordings import bag_profiles, bags
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from rbl_gym.app.terminal import add_json, add_seed, positive, progress, write_json
 from rbl_gym.checks import check_one_of
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 from rbl_gym.studies.learning.own_policies import OwnPolicy, PolicyLike, policy_like
 from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
 from rbl_gym.studies.learning.training import ALGORITHMS
@@ -94,23 +94,23 @@ def _add_worlds(parser: argparse.ArgumentParser) -> None:
         "or TOML file",
     )
     worlds.add_argument(
-        "--scenes",
+        "--family",
         metavar="F",
-        help="JSON or TOML file with scenes, of which each world draws one: a list, or a scene "
-        "whose values are ranges to draw from",
+        help="a family of scenes, of which each world draws one: a JSON or TOML file with a list "
+        "of scenes, or with a scene whose values are ranges to draw from",
     )
 
 
 def _worlds(options: argparse.Namespace) -> dict[str, Any]:
     """Return the requested worlds, as arguments of `RlTask.in_worlds`."""
-    if options.scenes:
-        return {"scenes": read_scenes(options.scenes)}
+    if options.family:
+        return {"scenes": read_scenes(options.family)}
     return {"scene": read_scene(options.scene)} if options.scene else {}
 
 
 def _title(options: argparse.Namespace, trained: bool = False) -> str:
     """Return a title for the task and its worlds, `trained`: those of the policy's training."""
-    worlds = options.scene or options.scenes or ("the scene of the training" if trained else "")
+    worlds = options.scene or options.family or ("the scene of the training" if trained else "")
     return f"{options.task} in {worlds}" if worlds else options.task
 
 
@@ -177,7 +177,7 @@ def _train(options: argparse.Namespace) -> int:
 
 def _command(options: argparse.Namespace, steps: int, algorithm: str) -> str:
     """Return the command that trains the policy again."""
-    worlds = {"--scene": options.scene, "--scenes": options.scenes}
+    worlds = {"--scene": options.scene, "--family": options.family}
     told = [f"{flag} {value}" for flag, value in worlds.items() if value]
     if algorithm != rl_task(options.task).algorithm:
         told.append(f"--algorithm {algorithm}")
@@ -232,7 +232,7 @@ def _references(options: argparse.Namespace, task: RlTask, default: list[str]) -
 def _require_searches(names: set[str]) -> None:
     """Raise MissingExtraError for a reference whose library is missing, before the others run."""
     if "cma-es" in names:
-        require("cmaes", "placement")
+        require("cmaes", "placement", "the reference cma-es")
 
 
 def _policies(paths: list[str]) -> dict[str, PolicyLike]:

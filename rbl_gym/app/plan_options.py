@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 
 if TYPE_CHECKING:
     from rbl_gym.placement.plans.drawing import Drawing
@@ -174,7 +174,7 @@ def check_report_options(options: argparse.Namespace) -> None:
         if not path.lower().endswith(SUFFIXES):
             raise ValueError(f"--export must end in one of {', '.join(SUFFIXES)}, got {path}")
         if path.lower().endswith(".dxf"):
-            require("ezdxf", "placement")
+            require("ezdxf", "placement", "a drawing (.dxf)")
     if options.report and not options.report.lower().endswith(".pdf"):
         raise ValueError(f"--report must end in .pdf, got {options.report}")
 

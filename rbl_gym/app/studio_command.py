@@ -9,7 +9,7 @@ from typing import Any
 from rbl_gym.app.plan_options import add_plan_options, is_plan, read_plan, read_problem
 from rbl_gym.app.reading_options import add_reading, read_runs
 from rbl_gym.app.terminal import FILTER_HELP, add_seed, names, natural, positive
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 
 
 def add_studio(commands: Any) -> None:
@@ -96,7 +96,7 @@ def _count_or_file(text: str) -> int | str:
 
 
 def _studio(options: argparse.Namespace) -> int:
-    require("viser", "studio")
+    require("viser", "studio", "the studio")
     from rbl_gym.app import studio
     from rbl_gym.app.studio.opening import Options
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.tables import has_rich, rich_console
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 from rbl_gym.studies.progress import Advance
 
 FILTER_HELP = (
@@ -74,7 +74,7 @@ def add_html(parser: argparse.ArgumentParser, shows: str) -> None:
 def check_html(options: argparse.Namespace) -> None:
     """Raise MissingExtraError if a page is requested and its library is missing."""
     if options.html:
-        require("plotly", "viz")
+        require("plotly", "viz", "--html")
 
 
 @contextlib.contextmanager

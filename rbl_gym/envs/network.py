@@ -30,6 +30,11 @@ from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import network as rendering
 
 REWARDS = ("bound", "none")
+_REWARD_ADVICE = (
+    "the wrapper EstimateNetwork(env, reward=...), or VectorEstimateNetwork, has the rewards "
+    "'belief' and 'error' (docs/environments/wrappers.md); for a reward of your own write a "
+    "gymnasium.Wrapper"
+)
 LENGTHS = ("none", "one", "all")
 # Standard deviation of the known length, as a fraction of the square's side: small enough to be
 # practically exact, and large enough for iterations to converge.
@@ -74,7 +79,7 @@ class PlanarNetworkVectorEnv(BatchEnv):
         # Largest values of all networks.
         most = self._plan = self._known(plan if self.family is None else self.family.highest)
         self.n_nodes = most.n_nodes
-        self._rewarded = check_one_of("reward", reward, REWARDS) == "bound"
+        self._rewarded = check_one_of("reward", reward, REWARDS, _REWARD_ADVICE) == "bound"
         square = (self.n_nodes, self.n_nodes)
         observed: dict[str, spaces.Space[Any]] = {
             "bearings": spaces.Box(-math.pi, math.pi, square, np.float64),

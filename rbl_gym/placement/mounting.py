@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.extras import require
 from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.geometry.regions import Faces
@@ -170,10 +171,7 @@ def _simplices(shapely: Any, shape: Any) -> list[FloatArray]:
 
 def shapely_module() -> Any:
     """Return shapely; the error without it names the extra."""
-    try:
-        import shapely  # an extra
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "files with [[mounts]] need the package shapely: pip install 'rbl-gym[placement]'"
-        ) from error
+    require("shapely", "placement", "a building file with [[mounts]]")
+    import shapely
+
     return shapely

@@ -69,7 +69,7 @@ def problem(
     ------
     ValueError
         If the problem is invalid; the message names the table of the file.
-    ModuleNotFoundError
+    MissingExtraError
         If the file has ``[[mounts]]`` and shapely is not installed.
     """
     if Path(scene).suffix.lower() in (".toml", ".json"):

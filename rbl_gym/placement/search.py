@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.extras import require
 from rbl_gym.placement import exchange, setting
 from rbl_gym.placement.descent import descend
 from rbl_gym.placement.layouts import Layout, amortised, ring
@@ -221,7 +222,7 @@ def cma_es(
 
     Raises
     ------
-    ModuleNotFoundError
+    MissingExtraError
         Without the package `cmaes`.
     """
     batch = context.centre.shape[:-1]
@@ -277,12 +278,9 @@ def shared_layout(
 
 
 def _strategy(mean: FloatArray, sigma: float, population: int, rng: np.random.Generator) -> Any:
-    try:
-        from cmaes import CMA  # an extra
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "CMA-ES needs the package cmaes: pip install 'rbl-gym[placement]'"
-        ) from error
+    require("cmaes", "placement", "the reference cma-es")
+    from cmaes import CMA
+
     seed = int(rng.integers(2**31))
     return CMA(mean=mean, sigma=sigma, population_size=population, seed=seed)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.extras import require
 from rbl_gym.recordings import bag_fields
 from rbl_gym.recordings.bag_profiles import KEYS, NO_PATHS, Source
 from rbl_gym.recordings.bag_tables import Row
@@ -36,13 +37,10 @@ def named(where: str) -> Iterator[None]:
 @contextmanager
 def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
     """Open the log with rosbags; raise ValueError with the file name if it cannot be read."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(
-            "reading bags needs the extra bags: pip install 'rbl-gym[bags]'"
-        ) from error
+    require("rosbags", "bags", "reading bags")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     paths = [Path(path) for path in all_paths(log)]
     for path in paths:
         if not path.exists():

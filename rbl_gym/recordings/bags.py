@@ -63,7 +63,7 @@ def convert_bag(
     ValueError
         If the log cannot be read, a topic or field does not exist (the message lists those that
         do), or no range is left.
-    ImportError
+    MissingExtraError
         If rosbags is not installed.
     """
     out = Path(out)

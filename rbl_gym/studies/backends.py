@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 
 __all__ = ["HERE", "Workers", "each"]
 
@@ -76,11 +76,12 @@ def check(workers: Workers) -> None:
     jobs, backend, _ = workers
     if backend is None and jobs == 1:
         return
-    require("joblib", "parallel", instead="leave out --jobs" if backend is None else "")
+    what = f"the backend {backend}" if backend else "running in several processes"
+    require("joblib", "parallel", what, instead="leave out --jobs" if backend is None else "")
     if backend == "dask":
-        require("distributed", "parallel")
+        require("distributed", "parallel", what)
     elif backend == "ray":
-        require("ray", "parallel", "ray")
+        require("ray", "parallel", what, also="ray")
 
 
 def _surviving(

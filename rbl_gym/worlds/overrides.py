@@ -13,6 +13,8 @@ from rbl_gym.measurements.noise_laws import NOISE_FORMS, NOISE_LAWS
 
 # Fields whose value is a name or a dict.
 _READ_BY_THEMSELVES = ("inertial",)
+# Fields that are a box or None. A dict gives the whole box.
+_OPTIONAL_BOXES = ("start_volume",)
 
 
 def replace(base: Any, changes: Mapping[str, Any], path: str, others: tuple[str, ...] = ()) -> Any:
@@ -70,21 +72,26 @@ def _check_fields(
 
 
 def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
-    unset = {"box": Box} if old is None else {}
-    kinds = next((k for k in (REGIONS, NOISE_LAWS) if isinstance(old, tuple(k.values()))), unset)
+    kinds = next((k for k in (REGIONS, NOISE_LAWS) if isinstance(old, tuple(k.values()))), {})
+    if old is None and path.endswith(_OPTIONAL_BOXES):
+        kinds, value = {"box": Box}, {"kind": "box", **value}
+    if not kinds and not dataclasses.is_dataclass(old):
+        raise ValueError(
+            f"{path} must be one value, got the dict {dict(value)!r:.80}; only scenes=... takes "
+            "values to draw from (uniform, log-uniform, integers, choice, repeat)"
+        )
     if "kind" not in value:
-        if not dataclasses.is_dataclass(old):
-            raise ValueError(
-                f"{path} must be one value, got the dict {dict(value)!r:.80} (only members of "
-                "scenes may have laws: uniform, log-uniform, integers, choice, repeat)"
-            )
         return replace(old, value, path)
     if not kinds:
         raise ValueError(f"{path} has only one kind: leave out kind, got {value['kind']!r}")
     forms = NOISE_FORMS if kinds is NOISE_LAWS else kinds
     kind = forms[check_one_of(f"{path}.kind", value["kind"], list(forms))]
     given = {key: item for key, item in value.items() if key != "kind"}
-    _check_fields(given, inspect.signature(kind).parameters, path)
+    fields = inspect.signature(kind).parameters
+    _check_fields(given, fields, path)
+    missing = [k for k, p in fields.items() if p.default is p.empty and k not in given]
+    if missing:
+        raise ValueError(f"{path} must have the field {missing[0]!r}, got {given!r:.80}")
     try:
         return kind(**given)
     except (TypeError, ValueError) as error:

@@ -13,7 +13,7 @@ from typing import Any
 
 from rbl_gym.app.studio.scene_view import PANEL
 from rbl_gym.checks import check_count
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 
 # Number of ports to try, from the first on.
 _PORTS = 50
@@ -30,7 +30,7 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym
     `port` on is used; 0 selects any. Raises MissingExtraError without viser (extra ``studio``),
     ValueError if the address does not belong to this machine or no port is free.
     """
-    require("viser", "studio")
+    require("viser", "studio", "the studio")
     import viser
 
     port = _free_port(host, check_count("port", port, least=0, most=65535))

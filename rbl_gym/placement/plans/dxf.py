@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.extras import require
 from rbl_gym.geometry.polygons import area, contains
 from rbl_gym.placement.plans.drawing import UNITS, Drawing, Label, Shape, scaled
 
@@ -181,14 +182,11 @@ def _middle(entity: Any, kind: str) -> FloatArray:
 
 def _open(path: str) -> Any:
     """Open the document; a damaged one is repaired if possible."""
-    try:
-        from ezdxf import recover
-        from ezdxf.filemanagement import readfile
-        from ezdxf.lldxf.const import DXFError
-    except ImportError:
-        raise ValueError(
-            f"{path}: reading a DXF needs the extra placement: pip install 'rbl-gym[placement]'"
-        ) from None
+    require("ezdxf", "placement", "a drawing (.dxf)")
+    from ezdxf import recover
+    from ezdxf.filemanagement import readfile
+    from ezdxf.lldxf.const import DXFError
+
     with Path(path).open("rb"):  # an OSError names the file
         pass
     try:

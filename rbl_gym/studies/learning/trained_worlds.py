@@ -58,7 +58,7 @@ def common_worlds(task: str, policies: Mapping[str, PolicyLike]) -> dict[str, An
         if other != worlds:
             raise ValueError(
                 f"policies {first!r} and {label!r} were trained in different scenes: choose "
-                "one by --scene or --scenes"
+                "one by --scene or --family"
             )
     for label in found:
         files = policies[label].meta.get("files", {})
@@ -67,7 +67,7 @@ def common_worlds(task: str, policies: Mapping[str, PolicyLike]) -> dict[str, An
             if state == "is not here" or _digest(path) != digest:
                 raise ValueError(
                     f"policy {label!r} was trained in a scene of {path}, which {state}: choose "
-                    "a scene by --scene or --scenes"
+                    "a scene by --scene or --family"
                 )
     return worlds
 

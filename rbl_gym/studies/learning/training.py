@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import check_one_of
-from rbl_gym.studies.extras import require
+from rbl_gym.extras import require
 from rbl_gym.studies.learning.policies import AnyPolicy, Policy, kind_and_outputs
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 from rbl_gym.studies.learning.sb3_models import policy_of
@@ -113,7 +113,7 @@ def check_training(task: RlTask, seed: int, algorithm: str | None = None) -> str
     if algorithm not in _TAUGHT:
         libraries += ["stable_baselines3"] if algorithm == "ppo" else ["sb3_contrib"]
     for library in libraries:
-        require(library, "rl")
+        require(library, "rl", "training")
     return algorithm
 
 

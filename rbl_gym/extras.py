@@ -1,0 +1,21 @@
+"""Report missing libraries that are installed by an extra."""
+
+from __future__ import annotations
+
+import importlib.util
+
+
+class MissingExtraError(ModuleNotFoundError):
+    """Raised if a library from one of the extras is missing."""
+
+
+def require(module: str, extra: str, what: str, also: str = "", instead: str = "") -> None:
+    """Raise MissingExtraError, with the command that installs the extra, if `module` is missing.
+
+    `what` needs the module. `also`: further libraries of no extra. `instead`: what else can be
+    done.
+    """
+    if importlib.util.find_spec(module) is None:
+        install = f"pip install 'rbl-gym[{extra}]' {also}".rstrip()
+        choice = f", or {instead}" if instead else ""
+        raise MissingExtraError(f"{what} needs the extra {extra}: {install}{choice}", name=module)
