@@ -63,14 +63,15 @@ class Run:
             links = rng.random(ranges.shape) > 0.2 if step in lost else np.ones(ranges.shape, bool)
             self.epochs.append((twist, ranges, links))
 
-    def states(self, name, engine, pick=()):
+    def states(self, name, engine, pick=(), plain=False):
         filter = estimators.make(name, engine=engine, **self.laws)
         state = filter.initial(self.start[0][pick], self.start[1][pick], self.prior)
         states = []
         for twist, ranges, links in self.epochs:
             twist = twist if twist.ndim == 1 else twist[pick]
             state = filter.predict(state, twist, 0.1)
-            states.append(filter.update(state, ranges[pick], self.anchors, links[pick]))
+            links = None if plain and links.all() else links[pick]
+            states.append(filter.update(state, ranges[pick], self.anchors, links))
             state = states[-1]
         return states
 
@@ -117,6 +118,8 @@ def test_a_covariance_that_all_trials_have_in_common_is_held_once(name):
     each = each.states(name, "auto")
     assert each[-1].covariance.shape == (12, 12, 12)
     assert_equal([s._replace(covariance=np.tile(s.covariance, (12, 1, 1))) for s in common], each)
+    plain = Run(TAGS["turned"], (12,), fixed=True, lost=(3,)).states(name, "auto", plain=True)
+    assert_equal(plain[:3], common[:3])
     lost = Run(TAGS["turned"], (12,), fixed=True, lost=(3,)).states(name, "auto")
     assert [s.covariance.ndim for s in lost[2:5]] == [2, 3, 3]
 

@@ -322,6 +322,31 @@ def test_linear_update(batch, weights, m, n, flat):
     assert_equal_forms(engines.inverse12, np.eye(12) + P)
 
 
+@every_weight
+@pytest.mark.parametrize(("trials", "m", "n"), [(1, 1, 2), (3, 4, 5), (8, 10, 6)])
+def test_linear_update_of_trials_with_one_covariance(weights, trials, m, n):
+    linear, one = Linear((trials,), m, n, weights), Linear((), m, n, weights)
+    P = engines.update_covariance(one.P, *one.epoch[1:])
+    told = one.anchors, one.tags, one.weights
+    means = assert_equal_forms(
+        engines.update_means, linear.mean, P, linear.ranges, *told, atol=1e-8
+    )[0]
+    # Far from the origin: the textbook form would lose the digits.
+    far = np.array([1e6, -2e6, 3e5])
+    shifted = linear.mean + np.concatenate([np.zeros(9), far])
+    with np.errstate(all="ignore"):
+        found = engines.update_means.kernel(shifted, P, linear.ranges, told[0] + far, *told[1:])
+    np.testing.assert_allclose(found - shifted, means - linear.mean, rtol=1e-6, atol=1e-6)
+    for wrong in (0.0, -1.0, np.nan, np.inf, 1e60):
+        spoiled = linear.ranges.copy()
+        spoiled[-1, 0, -1] = wrong
+        for form in (engines.update_means.kernel, engines.update_means.textbook):
+            with np.errstate(all="ignore"):
+                found = form(linear.mean, P, spoiled, *told)
+            assert np.isnan(found[-1]).all()
+            np.testing.assert_allclose(found[:-1], means[:-1], rtol=1e-6, atol=1e-8)
+
+
 @every_batch
 @pytest.mark.parametrize("law", [(0, 0.05, 0.0, -1), (0, 0.05, 0.01, 2), (1, 0.03, 0, 0)])
 @pytest.mark.parametrize(("m", "n"), [(4, 5), (10, 6)])

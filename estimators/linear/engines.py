@@ -116,6 +116,24 @@ def update_mean(
     return mean + (P @ innovation)[..., 0]
 
 
+@compiled("linear_filter:update_means")
+def update_means(
+    means: FloatArray,
+    P: FloatArray,
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """Return `update_mean` of trials (T, 12) that differ only in their means and ranges.
+
+    NaN for trials with a range that is not positive or not finite.
+    """
+    sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))[:, None]
+    found = update_mean.textbook(means, P, ranges, anchors, tags, weights)
+    return np.where(sound, found, np.nan)
+
+
 @compiled("linear_filter:is_vague")
 def is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArray:
     """Return whether a covariance is uninformative (...) on an entry of Q, or on the position."""

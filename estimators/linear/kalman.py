@@ -44,6 +44,8 @@ from rbl_gym.estimators.linear.engines import (
     Motion,
     engine_for,
     is_vague,
+    update_covariance,
+    update_means,
     update_plain,
     weigh_plain,
 )
@@ -198,15 +200,7 @@ class KalmanFamily:
         if self.weights is None:
             weights = 1 / epoch_variance(noise, self.noise, ranges, mask, squared=True)
         else:
-            weights = np.asarray(self.weights, dtype=np.float64)
-            weights = weights[..., None] if weights.ndim == 1 else weights
-            if weights.shape[-2] != ranges.shape[-2] or weights.shape[-1] not in (
-                1,
-                self.tags.shape[-2],
-            ):
-                raise ValueError(
-                    f"weights must fit links {ranges.shape[-2:]}, got shape {weights.shape}"
-                )
+            weights = self._fixed_weights(ranges)
         if state.mean.ndim > 1 or ranges.ndim > 2:
             check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
         if mask is not None:
@@ -230,13 +224,13 @@ class KalmanFamily:
 
         Other epochs need the general code, which also raises the errors.
         """
+        if links is not None or noise is not None or self.constraint != "none":
+            return None
+        if self.weights is not None:
+            return self._update_common(state, ranges, anchors)
         batch = state.mean.shape[:-1]
         if (
-            links is not None
-            or noise is not None
-            or self.weights is not None
-            or self.constraint != "none"
-            or state.covariance.shape[:-2] != batch
+            state.covariance.shape[:-2] != batch
             or links_of_plain_epoch(ranges, anchors, self.tags, batch) is None
         ):
             return None
@@ -256,6 +250,36 @@ class KalmanFamily:
             epoch = LinearEpoch(np.asarray(ranges), np.asarray(anchors), self.tags, weights)
             mean, covariance = FilterPy.update(*plain(state)[:2], epoch)
         return KalmanState(mean, covariance, np.zeros(batch, bool))
+
+    def _update_common(self, state: KalmanState, ranges: Any, anchors: Any) -> KalmanState | None:
+        """Return the KF update of trials with one covariance, by fixed weights; None for others."""
+        mean, P, _ = state
+        if (
+            mean.ndim != 2
+            or P.ndim != 2
+            or np.ndim(self.weights) > 2
+            or np.shape(ranges)[:-2] != mean.shape[:1]
+            or not len(mean)
+            or links_of_plain_epoch(ranges[0], anchors, self.tags, ()) is None
+            or not all_finite(anchors)
+            or engine_for(self.engine, state=mean.shape[:1]) is not Batched
+        ):
+            return None
+        self._check_determined(state, anchors)
+        weights = self._fixed_weights(ranges)
+        P = update_covariance(P, anchors, self.tags, weights)
+        mean = update_means(mean, P, ranges, anchors, self.tags, weights)
+        # The general code raises the error of a range.
+        return KalmanState(mean, P, np.zeros(len(mean), bool)) if all_finite(mean) else None
+
+    def _fixed_weights(self, ranges: FloatArray) -> FloatArray:
+        """Return the weights of the filter, (M, 1) or (..., M, N), or raise ValueError."""
+        weights = np.asarray(self.weights, dtype=np.float64)
+        weights = weights[..., None] if weights.ndim == 1 else weights
+        links = ranges.shape[-2:]
+        if weights.shape[-2] != links[0] or weights.shape[-1] not in (1, links[1]):
+            raise ValueError(f"weights must fit links {links}, got shape {weights.shape}")
+        return weights
 
     def belief(self, state: KalmanState) -> PoseBelief:
         """Return the pose, its covariance, and the raw matrix (copies).

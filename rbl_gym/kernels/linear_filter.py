@@ -237,6 +237,73 @@ def update_mean(
     _take_mean(mean, P, ranges, anchors, tags, weights, new_mean)
 
 
+@gufunc("(t,p),(p,p),(t,m,n),(m,d),(n,d),(m,w)->(t,p)")
+def update_means(
+    means: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_means: Any
+) -> None:
+    """Compute `update_mean` of many trials with one P, whose y is linear in x and ``r^2``.
+
+    NaN for trials with a range that is not positive. ``y = y_0 - G x + sum_n c_e kron sum_m
+    W_mn r_mn^2``, with ``W = -2 w (a_m - a)``. Positions are relative to an anchor: large
+    coordinates would cost digits.
+    """
+    n_anchors, n_tags = anchors.shape[0], tags.shape[0]
+    G, gain = zeros((_STATES, _STATES)), workspace((_STATES, _STATES))
+    _add_information(G, anchors, tags, weights)
+    for i in range(_STATES):
+        for j in range(_STATES):
+            gain[i, j] = P[i, j]
+            if j < i:
+                G[j, i] = G[i, j]
+    W, origin = np.empty((n_tags * n_anchors, 3)), zeros((_STATES,))
+    y_0, y, x = zeros((_STATES,)), workspace((_STATES,)), workspace((_STATES,))
+    for i in range(3):
+        origin[9 + i] = anchors[0, i]
+    for n in range(n_tags):
+        column = n if weights.shape[1] > 1 else 0
+        x0, x1, x2 = _weighted_mean(anchors, weights, column)
+        for m in range(n_anchors):
+            w, row = -2 * weights[m, column], n * n_anchors + m
+            W[row, 0] = w * (anchors[m, 0] - x0)
+            W[row, 1] = w * (anchors[m, 1] - x1)
+            W[row, 2] = w * (anchors[m, 2] - x2)
+            square = 0.0
+            for i in range(3):
+                square += (anchors[m, i] - origin[9 + i]) ** 2
+            for k in range(4):
+                c = tags[n, k] if k < 3 else 1.0
+                for i in range(3):
+                    y_0[3 * k + i] -= c * square * W[row, i]
+    for t in range(means.shape[0]):
+        for i in range(_STATES):
+            y[i] = y_0[i]
+            x[i] = means[t, i]
+        for j in range(_STATES):
+            value = x[j] - origin[j]
+            for i in range(_STATES):
+                y[i] -= value * G[j, i]
+        sound = True
+        for n in range(n_tags):
+            b0 = b1 = b2 = 0.0
+            for m in range(n_anchors):
+                r, row = ranges[t, m, n], n * n_anchors + m
+                sound = sound and 0.0 < r < HUGE
+                square = r * r
+                b0 += square * W[row, 0]
+                b1 += square * W[row, 1]
+                b2 += square * W[row, 2]
+            for k in range(4):
+                c = tags[n, k] if k < 3 else 1.0
+                y[3 * k] += c * b0
+                y[3 * k + 1] += c * b1
+                y[3 * k + 2] += c * b2
+        for j in range(_STATES):
+            for i in range(_STATES):
+                x[i] += y[j] * gain[j, i]
+        for i in range(_STATES):
+            new_means[t, i] = x[i] if sound else math.nan
+
+
 @helper
 def _weigh(ranges: Any, law: Any, weights: Any) -> bool:
     """Compute inverse variances of the squared ranges; return whether all ranges are positive.
