@@ -8,6 +8,7 @@ After a long time the observation has the standard deviation S itself.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,11 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
             "level needs the state of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', "
             f"'iekf-log'), got a state with {', '.join(fields) or type(predicted).__name__}"
         )
+    return held(before, predicted, level.numbers)
+
+
+def held(before: Any, predicted: Any, level: FloatArray) -> Any:
+    """Return the state of `hold_level` for the numbers (3,) of a level."""
     P0, P = before.covariance, predicted.covariance
     Q, t = predicted.rotation, predicted.translation
     extra = getattr(predicted, "extra", np.zeros((*t.shape[:-1], 0)))
@@ -77,27 +83,28 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
         "translation": t + step[..., 3:6],
         "covariance": P,
     }
-    if "extra" in fields:
+    if hasattr(predicted, "extra"):
         found["extra"] = extra + step[..., 6:]
     return predicted._replace(**found)
 
 
 def _known(
-    Q: FloatArray, t: FloatArray, level: Level
+    Q: FloatArray, t: FloatArray, level: FloatArray
 ) -> list[tuple[FloatArray, FloatArray, float]]:
     """Return rows (..., 6) by the pose error, residuals (...) and standard deviations."""
     known: list[tuple[FloatArray, FloatArray, float]] = []
-    if level.height_m is not None and level.height_std_m is not None:
+    height, height_std, tilt_std = level.tolist()
+    if height_std < math.inf:
         row = np.zeros((*t.shape[:-1], 6))
         row[..., 5] = 1.0
-        known.append((row, level.height_m - t[..., 2], level.height_std_m))
-    if level.tilt_std_rad is not None:
+        known.append((row, height - t[..., 2], height_std))
+    if tilt_std < math.inf:
         # An error w rotates the body's z axis u by w x u; for a level body u is (0, 0, 1).
         x, y, z = np.moveaxis(Q[..., :, 2], -1, 0)
         for place, parts in ((0, (0 * z, z, -y)), (1, (-z, 0 * z, x))):
             row = np.zeros((*t.shape[:-1], 6))
             row[..., :3] = np.stack(parts, axis=-1)
-            known.append((row, -(x, y)[place], level.tilt_std_rad))
+            known.append((row, -(x, y)[place], tilt_std))
     return known
 
 

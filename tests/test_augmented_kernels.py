@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from rbl_gym import kernels
 from rbl_gym.estimators.costs.bias_cost import update_augmented
-from rbl_gym.estimators.iekf.augmented import LOSSES, predict_augmented
+from rbl_gym.estimators.iekf.augmented import LOSSES
+from rbl_gym.estimators.iekf.augmented_steps import predict_augmented
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from tests.helpers import random_world, simulate

@@ -13,7 +13,8 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording
 from rbl_gym.studies import replay
-from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
+from rbl_gym.studies.epochs import Reading, track_epochs
+from rbl_gym.studies.groups import innovations_of
 from rbl_gym.studies.replay.tracking import start_of
 from tests.helpers import with_kernels
 

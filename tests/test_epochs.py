@@ -16,13 +16,13 @@ from rbl_gym.studies.epochs import (
     Reading,
     Step,
     axis_errors,
-    innovations_of,
     nees_interval,
     pose_errors,
     stack_beliefs,
     timed,
     track_epochs,
 )
+from rbl_gym.studies.groups import innovations_of
 from rbl_gym.worlds import scenes
 from tests.helpers import random_world
 
@@ -151,10 +151,10 @@ def test_an_honest_filter_foretells_its_ranges_as_well_as_it_says():
     size = scene.n_anchors * len(scene.tags)
     told = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
     found_of = innovations_of(filter, steps, np.asarray(scene.tags), scene.noise)
-    each = [(s, [a[k] for a in i]) for steps, i in found_of for k, s in enumerate(steps)]
-    for (step, values), reading in zip(each, told, strict=True):
+    each = [(g.reading.ranges[k], [a[k] for a in i]) for g, i in found_of for k in range(g.count)]
+    for (ranges, values), reading in zip(each, told, strict=True):
         found = Innovations(*values)
-        np.testing.assert_array_equal(step.reading.ranges, reading.ranges)
+        np.testing.assert_array_equal(ranges, reading.ranges)
         assert found.nis.shape == found.dof.shape == (300,)
         # One range in 16,000 is refused.
         assert (found.dof >= size - 2).all()
@@ -166,16 +166,18 @@ def test_innovations_come_with_their_steps(name):
     """Many epochs at once are the same as one after the other, whatever their laws and links."""
     tags, prior, readings = world(6)
     filter = estimators.make(name, tags=tags, noise=NOISE, process=PROCESS)
-    groups = innovations_of(filter, track_epochs(filter, prior, readings), tags, NOISE)
-    pairs = [(s, [a[k] for a in i]) for steps, i in groups for k, s in enumerate(steps)]
-    assert len(pairs) == len(readings)
-    for (step, found), reading in zip(pairs, readings, strict=True):
-        assert step.reading is reading
+    steps = [*track_epochs(filter, prior, readings)]
+    groups = [*innovations_of(filter, steps, tags, NOISE)]
+    assert sum(group.count for group, _ in groups) == len(readings)
+    pairs = [(g.belief, i, k) for g, i in groups for k in range(g.count)]
+    for step, (belief, found, k) in zip(steps, pairs, strict=True):
+        reading = step.reading
         law = NOISE if reading.noise is None else reading.noise
         told = reading.ranges, reading.anchors, tags, law, reading.links
         alone = estimators.innovations(filter, step.predicted, step.state, *told)
+        np.testing.assert_array_equal(belief.translation[k], step.belief.translation)
         for one, other in zip(alone, found, strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(one, other[k], rtol=1e-9, atol=1e-9)
 
 
 def test_a_trace_is_of_the_beliefs():

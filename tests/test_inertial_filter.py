@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rbl_gym import bounds, estimators, kernels, metrics, motion
 from rbl_gym.bounds import inertial as inertial_bounds
 from rbl_gym.estimators.bank.headings import HeadingBank
-from rbl_gym.estimators.iekf.augmented import carry_states
+from rbl_gym.estimators.iekf.augmented_steps import carry_states
 from rbl_gym.estimators.iekf.inertial import InertialEkf, fade
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import inertial, link_bias, ranging

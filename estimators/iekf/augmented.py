@@ -16,25 +16,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds
-from rbl_gym.bounds.twist import covariance_after
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
-from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
+from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief
+from rbl_gym.estimators.iekf.augmented_steps import carried, predict_augmented, track_augmented
 from rbl_gym.estimators.iekf.directed import directed, undirected
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.inputs import check_batches, check_one_process, plain
+from rbl_gym.estimators.smoothing.knowledge import Level
 from rbl_gym.geometry import rotations
-from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.ranging import NoiseLaw
-from rbl_gym.motion.kinematics import propagate
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 
 # Losses of whitened innovations, by `robust`. Residuals of real ranges have heavier tails than
@@ -163,7 +161,7 @@ class AugmentedEkf:
         state = plain(state)
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
         if not self.biases and self.directions is None:
-            return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
+            return carried(state, self.pose.update(pose, ranges, anchors, links, noise))
         ranges, variance, anchors, mask = self.pose.measured(state, ranges, anchors, links, noise)
         if ranges.shape != variance.shape:
             ranges, variance = np.broadcast_arrays(ranges, variance)
@@ -193,6 +191,74 @@ class AugmentedEkf:
         # A row suffices: all of them are NaN if the pose is not determined.
         as_state(*found[:2], found.covariance[..., 0, :])
         return found
+
+    def track(
+        self,
+        state: AugmentedState,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
+        twist: ArrayLike | None = None,
+        dt: ArrayLike = 0.0,
+        level: Level | None = None,
+    ) -> tuple[AugmentedState, AugmentedState] | None:
+        """Predict and update over E epochs in one call; the same as one after the other.
+
+        Parameters
+        ----------
+        state
+            The state before the first prediction.
+        ranges, anchors, links, noise
+            As in `update`, with an axis of epochs: ranges (..., E, M, N), anchors (..., E, M, 3).
+        twist, dt
+            As in `predict`, (..., E, 6) and (E,), of the intervals that end at the epochs. With 0 s
+            there is no prediction.
+        level
+            Known height and tilt, which every prediction is followed by (`hold_level`).
+
+        Returns
+        -------
+        The states before and after the updates of the first e <= E epochs, arrays (..., e, ...);
+        None if there are none. The track ends before an epoch that `predict` and `update` must take
+        alone: the first one with biases, one with a vague rotation, one that raises an error. All
+        epochs are alone if the filter has an offset, directions, a sensor, or no biases (`tracks`).
+
+        Raises
+        ------
+        ValueError
+            As in `update`.
+        """
+        states = self._n_twist + len(self.biases) * math.prod(np.shape(ranges)[-2:])
+        if not self.tracks or state.extra.shape[-1] != states:
+            return None
+        ranges, variance, anchors, mask = self.pose.measured(state, ranges, anchors, links, noise)
+        dt = check_array("dt", np.broadcast_to(dt, ranges.shape[-3:-2]), ("E",))
+        told = _AT_REST if twist is None else check_array("twist", twist, (6,))
+        *fields, count = track_augmented(
+            *plain(state), np.broadcast_to(told, (*told.shape[:-2], len(dt), 6)), dt,
+            self._process, self._wander, self._laws, self._n_twist,
+            (Level() if level is None else level).numbers,
+            *np.broadcast_arrays(ranges, 1 / variance if mask is None else mask / variance),
+            np.broadcast_to(anchors, (*anchors.shape[:-3], len(dt), *anchors.shape[-2:])),
+            self.pose.tags, self.pose.iterations, LOSSES[self.pose.robust],
+        )  # fmt: skip
+        if not (done := int(count.min())):
+            return None
+        ranks = 2 * (2, 1, 1, 2)
+        kept = [
+            field[(..., slice(done), *(slice(None),) * rank)]
+            for field, rank in zip(fields, ranks, strict=True)
+        ]
+        before, after = AugmentedState(*kept[:4]), AugmentedState(*kept[4:])
+        as_state(*after[:2], after.covariance[..., 0, :])
+        return before, after
+
+    @property
+    def tracks(self) -> bool:
+        """Return whether `track` takes epochs of this filter."""
+        alone = self.directions is None and self.offset is None and self.sensor is None
+        return type(self) is AugmentedEkf and bool(self.biases) and alone
 
     def _updated(
         self,
@@ -270,51 +336,6 @@ class AugmentedEkf:
         return PoseBelief(rotation, state.translation.copy(), covariance, rotation)
 
 
-@compiled("augmented_filter:predict")
-def predict_augmented(
-    rotation: FloatArray,
-    translation: FloatArray,
-    extra: FloatArray,
-    covariance: FloatArray,
-    twist: FloatArray,
-    dt: float,
-    process: FloatArray,
-    wander: FloatArray,
-    laws: FloatArray,
-    n_twist: int,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the fields of a state after `dt` seconds.
-
-    Parameters
-    ----------
-    rotation, translation, extra, covariance
-        As in `AugmentedState`.
-    twist
-        (..., 6), if it is known and not in the state (`n_twist` 0).
-    process, wander
-        Variances (6,) after 1 s: of the pose besides its twist, and of the twist.
-    laws
-        (n, 3) of the biases: standard deviation, time (infinite: constant), common standard
-        deviation. Biases are Gauss-Markov processes.
-    """
-    moving = extra[..., :6] if n_twist else twist
-    moved = propagate(rotation, translation, moving, dt)
-    P = covariance_after(covariance, moving, dt, process, wander if n_twist else None)
-    links = (extra.shape[-1] - n_twist) // max(1, len(laws))
-    kept = np.ones(P.shape[-1])
-    blocks = [
-        slice(6 + n_twist + k * links, 6 + n_twist + (k + 1) * links) for k in range(len(laws))
-    ]
-    for block, (_, time, _) in zip(blocks, laws, strict=True):
-        kept[block] = np.exp(-dt / time)
-    P = P * kept[:, None] * kept
-    for block, (std, time, common) in zip(blocks, laws, strict=True):
-        fresh = std**2 * np.eye(links) + common**2
-        P[..., block, block] += (1 - np.exp(-dt / time) ** 2) * fresh
-    extra = np.broadcast_to(extra * kept[6:], (*moved[1].shape[:-1], extra.shape[-1]))
-    return *moved, extra, P
-
-
 def told_twist(
     filter: AugmentedEkf, state: AugmentedState, twist: ArrayLike | None
 ) -> tuple[AugmentedState, FloatArray]:
@@ -345,37 +366,3 @@ def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> 
         state.extra + step[..., 6:],
         0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
     )
-
-
-def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
-    """Return the state after an update of its pose; other states change by their correlation."""
-    return AugmentedState(pose.rotation, pose.translation, *carry_states(*state, *pose))
-
-
-@compiled("carried_states:carry")
-def carry_states(
-    rotation: FloatArray,
-    translation: FloatArray,
-    extra: FloatArray,
-    covariance: FloatArray,
-    new_rotation: FloatArray,
-    new_translation: FloatArray,
-    new_covariance: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return extra states (..., K) and covariance (..., 6 + K, 6 + K) for a new pose.
-
-    The first four arguments are the previous state, the others the pose found by an update.
-    """
-    P, new = covariance, new_covariance
-    turn = rotations.error(new_rotation, rotation)
-    error, D = pose_error(turn, new_translation - translation)
-    gain = P[..., 6:, :6] @ positive_inverse(P[..., :6, :6])
-    # The error about the new pose is that about the old one times blkdiag(Jl^-1, I).
-    slope = gain @ D
-    across = slope @ new
-    kept = P[..., 6:, 6:] - gain @ P[..., :6, 6:] + across @ np.swapaxes(slope, -1, -2)
-    covariance = np.empty((*new.shape[:-2], *P.shape[-2:]))
-    covariance[..., :6, :6] = new
-    covariance[..., 6:, :6], covariance[..., :6, 6:] = across, np.swapaxes(across, -1, -2)
-    covariance[..., 6:, 6:] = bounds.symmetric(kept)
-    return extra + (gain @ error[..., None])[..., 0], covariance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,12 @@ class Level:
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), low=1e-9)
         check_number("time_s", self.time_s, low=1e-9)
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Return height, its standard deviation, and that of the tilt (3,); infinite: unknown."""
+        known = self.height_std_m, self.tilt_std_rad
+        return np.array([self.height_m or 0.0, *(math.inf if x is None else x for x in known)])
 
     constants_std = np.zeros(0)
 

@@ -6,12 +6,13 @@ The textbook forms are `estimators/iekf/augmented.py` and `estimators/costs/bias
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.bias_cost import innovation, linearize, shares, weigh, whiten
-from rbl_gym.kernels.jit import gufunc
+from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import (
     cholesky6,
     fill,
@@ -28,13 +29,11 @@ _LONGEST = 1e12
 _SAME_SHARE = 0.01
 
 
-@gufunc(
-    "(d,d),(d),(k),(s,s),(p),(),(p),(p),(l,q),()->(d,d),(d),(k),(s,s)",
-    "fffffffffiffff",
-)
-def predict(
-    Q0, t0, extra0, P0, twist, dt, variance, wander, laws, n_twist, Q, t, extra, P
-):  # fmt: skip
+@helper
+def move(
+    Q0: Any, t0: Any, extra0: Any, P0: Any, twist: Any, dt: float, variance: Any, wander: Any,
+    laws: Any, n_twist: int, Q: Any, t: Any, extra: Any, P: Any,
+) -> None:  # fmt: skip
     """Predict pose, twist and biases: ``F P F^T + G Q G^T`` with decaying biases."""
     turn, J, both = workspace((3, 3)), workspace((3, 3)), workspace((3, 3))
     kept = np.empty(max(1, laws.shape[0]))
@@ -110,14 +109,12 @@ def predict(
                 P[begin + i, begin + i] += fresh * laws[a, 0] * laws[a, 0]
 
 
-@gufunc(
-    "(d,d),(d),(k),(s,s),(m,n),(m,n),(m,d),(n,d),(d,d),(d),(p,p),(),(l),()->(d,d),(d),(k),(s,s)",
-    "fffffffffffififfff",
-)
-def update(
-    Q0, t0, extra0, P0, ranges, weights, anchors, tags, start_Q, start_t, start_P, iterations,
-    loss, n_twist, Q, t, extra, P,
-):  # fmt: skip
+@helper
+def revise(
+    Q0: Any, t0: Any, extra0: Any, P0: Any, ranges: Any, weights: Any, anchors: Any, tags: Any,
+    start_Q: Any, start_t: Any, start_P: Any, iterations: int, loss: Any, n_twist: int,
+    Q: Any, t: Any, extra: Any, P: Any,
+) -> None:  # fmt: skip
     """Compute the most likely pose of an epoch whose ranges have biases, and further results."""
     size, n_tags = P0.shape[0], tags.shape[0]
     n_links = weights.shape[0] * n_tags
@@ -293,3 +290,29 @@ def update(
                 line[j] -= a * told_by[k, j]
         for j in range(i + 1):
             P[6 + i, 6 + j] = P[6 + j, 6 + i] = line[j]
+
+
+@gufunc(
+    "(d,d),(d),(k),(s,s),(p),(),(p),(p),(l,q),()->(d,d),(d),(k),(s,s)",
+    "fffffffffiffff",
+)
+def predict(
+    Q0, t0, extra0, P0, twist, dt, variance, wander, laws, n_twist, Q, t, extra, P
+):  # fmt: skip
+    """Run `move` for one interval."""
+    move(Q0, t0, extra0, P0, twist, dt, variance, wander, laws, n_twist, Q, t, extra, P)
+
+
+@gufunc(
+    "(d,d),(d),(k),(s,s),(m,n),(m,n),(m,d),(n,d),(d,d),(d),(p,p),(),(l),()->(d,d),(d),(k),(s,s)",
+    "fffffffffffififfff",
+)
+def update(
+    Q0, t0, extra0, P0, ranges, weights, anchors, tags, start_Q, start_t, start_P, iterations,
+    loss, n_twist, Q, t, extra, P,
+):  # fmt: skip
+    """Run `revise` for one epoch."""
+    revise(
+        Q0, t0, extra0, P0, ranges, weights, anchors, tags, start_Q, start_t, start_P, iterations,
+        loss, n_twist, Q, t, extra, P,
+    )  # fmt: skip

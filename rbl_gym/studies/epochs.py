@@ -6,7 +6,6 @@ replayed recordings, tracking with designed layouts.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -17,9 +16,10 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import metrics
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators import Filter, Innovations, PoseBelief, innovations
+from rbl_gym.estimators import Filter, PoseBelief, hold_level
 from rbl_gym.estimators.filter import reads
-from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
+from rbl_gym.estimators.smoothing.knowledge import Level
+from rbl_gym.measurements.ranging import NoiseLaw
 
 __all__ = [
     "AxisErrors",
@@ -27,7 +27,6 @@ __all__ = [
     "Reading",
     "Step",
     "axis_errors",
-    "innovations_of",
     "nees_interval",
     "pose_errors",
     "stack_beliefs",
@@ -85,13 +84,18 @@ class Step(NamedTuple):
     belief: PoseBelief
     reading: Reading
 
+    @property
+    def count(self) -> int:
+        """The number of epochs."""
+        return 1
+
 
 def track_epochs(
     filter: Filter,
     prior: Prior,
     readings: Iterable[Reading],
     restart: Callable[[PoseBelief, FloatArray], Prior | None] | None = None,
-    hold: Callable[[Any, Any], Any] | None = None,
+    level: Level | None = None,
 ) -> Iterator[Step]:
     """Run a filter over epochs, and yield each step.
 
@@ -107,9 +111,9 @@ def track_epochs(
     restart
         Called with every belief and the anchors of its epoch. If it returns a prior, the filter
         restarts from it and uses the ranges of the same epoch again.
-    hold
-        Called with the states before and after every prediction, to apply constraints such as
-        `rbl_gym.estimators.hold_level`. The state that it returns is updated.
+    level
+        Known height and tilt of the body, applied after every prediction
+        (`rbl_gym.estimators.hold_level`).
 
     Yields
     ------
@@ -118,23 +122,33 @@ def track_epochs(
     """
     state = filter.initial(*prior)
     for reading in readings:
-        told = reading.twist
-        dt: Any = reading.dt
-        if (sensor := reads(filter)) != "twist":
-            measured = getattr(reading, sensor)
-            if told is not None and measured is None:
-                raise ValueError(f"the filter needs {_SENSORS[sensor]}, but the readings have none")
-            told, dt = measured, reading.dt if reading.steps is None else reading.steps
-        if told is not None:
-            moved = filter.predict(state, told, dt)
-            state = moved if hold is None else hold(state, moved)
-        predicted, state = state, _updated(filter, state, reading)
+        step = next_step(filter, state, reading, restart, level)
+        state = step.state
+        yield step
+
+
+def next_step(
+    filter: Filter, state: Any, reading: Reading, restart: Any, level: Level | None
+) -> Step:
+    """Return the step of an epoch from the state at the epoch before it."""
+    told = reading.twist
+    dt: Any = reading.dt
+    if (sensor := reads(filter)) != "twist":
+        measured = getattr(reading, sensor)
+        if told is not None and measured is None:
+            raise ValueError(f"the filter needs {_SENSORS[sensor]}, but the readings have none")
+        told, dt = measured, reading.dt if reading.steps is None else reading.steps
+    predicted = state
+    if told is not None:
+        predicted = filter.predict(state, told, dt)
+        predicted = predicted if level is None else hold_level(state, predicted, level)
+    state = _updated(filter, predicted, reading)
+    belief = filter.belief(state)
+    if restart is not None and (other := restart(belief, reading.anchors)) is not None:
+        predicted = filter.initial(*other)
+        state = _updated(filter, predicted, reading)
         belief = filter.belief(state)
-        if restart is not None and (other := restart(belief, reading.anchors)) is not None:
-            predicted = filter.initial(*other)
-            state = _updated(filter, predicted, reading)
-            belief = filter.belief(state)
-        yield Step(predicted, state, belief, reading)
+    return Step(predicted, state, belief, reading)
 
 
 def _updated(filter: Filter, state: Any, reading: Reading) -> Any:
@@ -164,76 +178,6 @@ def stack_beliefs(beliefs: Iterable[PoseBelief]) -> PoseBelief:
     """Stack the beliefs of K epochs to one, with arrays (K, ...)."""
     columns = zip(*beliefs, strict=True)
     return PoseBelief(*(np.array(column, dtype=np.float64) for column in columns))
-
-
-# Epochs of one body per group: their matrices fit into the processor caches.
-_CHUNK = 256
-
-
-def innovations_of(
-    filter: Filter, steps: Iterable[Step], tags: FloatArray, noise: NoiseLaw
-) -> Iterator[tuple[list[Step], Innovations]]:
-    """Yield steps in groups of K, each group with its innovations, arrays (K, ...).
-
-    The innovations are those of `estimators.innovations`, for many epochs at once.
-
-    Parameters
-    ----------
-    filter
-        The filter of the steps.
-    steps
-        Steps from `track_epochs`.
-    tags
-        Tag positions on the body (N, 3).
-    noise
-        Noise law of epochs without their own.
-    """
-    kept: list[Step] = []
-    shapes: list[tuple[int, ...]] = []
-    for step in steps:
-        trials = math.prod(step.belief.translation.shape[:-1])
-        before, shapes = shapes, _shapes(step)
-        if kept and (len(kept) * trials >= _CHUNK or shapes != before):
-            yield kept, _innovations(filter, kept, tags, noise)
-            kept = []
-        kept.append(step)
-    if kept:
-        yield kept, _innovations(filter, kept, tags, noise)
-
-
-def _shapes(step: Step) -> list[tuple[int, ...]]:
-    return [a.shape for a in (*step.predicted, *step.state, *step.reading[:2])]
-
-
-def _innovations(
-    filter: Filter, steps: list[Step], tags: FloatArray, noise: NoiseLaw
-) -> Innovations:
-    before, after = (
-        type(states[0])(*(np.array(field) for field in zip(*states, strict=True)))
-        for states in ([step.predicted for step in steps], [step.state for step in steps])
-    )
-    readings = [step.reading for step in steps]
-    ranges = np.array([reading.ranges for reading in readings])
-    shape = ranges.shape[1:]
-    anchors = np.array([reading.anchors for reading in readings])
-    missing = (1,) * (ranges.ndim - anchors.ndim)
-    anchors = anchors.reshape(len(anchors), *missing, *anchors.shape[1:])
-    all_there = np.ones(shape, dtype=np.bool_)
-    links = np.array(
-        [
-            all_there
-            if r.links is None
-            else (r.links if r.links.shape == shape else np.broadcast_to(r.links, shape))
-            for r in readings
-        ]
-    )
-    own = [reading.noise for reading in readings]
-    variance = np.broadcast_to(noise.variance(ranges, links), ranges.shape).copy()
-    for k, law in enumerate(own):
-        if law is not None:
-            variance[k] = law.variance(ranges[k], links[k])
-    law = LinkNoise(np.sqrt(np.where(links, variance, 1.0)))
-    return innovations(filter, before, after, ranges, anchors, tags, law, links)
 
 
 class PoseErrors(NamedTuple):

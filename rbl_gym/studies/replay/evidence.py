@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym import estimators, motion
 from rbl_gym.checks import FloatArray
-from rbl_gym.estimators import IteratedEkf, hold_level
+from rbl_gym.estimators import IteratedEkf
 from rbl_gym.measurements.ranging import LinkNoise, RangeNoise
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.epochs import Reading, innovations_of, stack_beliefs, track_epochs
+from rbl_gym.studies.epochs import Reading, track_epochs
+from rbl_gym.studies.groups import innovations_of
 from rbl_gym.studies.replay.place import level_of, own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import prior_of, recording_filter, sensed
@@ -104,12 +104,11 @@ def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
     prior = tuple(map(np.array, zip(*(prior_of(*trial) for trial in trials), strict=True)))
     tags = np.stack([trial.recording.tags for trial in trials])
     level = level_of(trials[0].settings, np.zeros(3))
-    hold = None if level is None else partial(hold_level, level=level)
     told = _readings(trials)
-    steps = track_epochs(filter, prior, told, hold=hold)  # pyright: ignore[reportArgumentType]
+    steps = track_epochs(filter, prior, told, level=level)  # pyright: ignore[reportArgumentType]
     columns: list[tuple[FloatArray, ...]] = []
     for group, i in innovations_of(filter, steps, tags, RangeNoise()):
-        rotation, translation, *_ = stack_beliefs(step.belief for step in group)
+        rotation, translation, *_ = group.belief
         columns.append((i.log_likelihood, i.nis, i.dof, rotation, translation, i.residual))
     stacked = [np.concatenate(column).swapaxes(0, 1) for column in zip(*columns, strict=True)]
     return list(zip(*stacked, strict=True))

@@ -9,6 +9,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.studies.replay.figures import error_figures
 from rbl_gym.studies.replay.judging import TrackErrors
 from rbl_gym.studies.replay.settings import Settings
@@ -36,7 +37,7 @@ class ReplayedRuns(NamedTuple):
 def replay_runs(
     recordings: Mapping[str, Recording],
     settings: Settings,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> ReplayedRuns:
     """Replay the runs of a log, each from its own start.
 
@@ -47,7 +48,7 @@ def replay_runs(
     settings
         Settings of the filter.
     advance
-        Called after every epoch.
+        Called with the number of epochs done.
 
     Raises
     ------

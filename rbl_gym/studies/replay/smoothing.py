@@ -19,17 +19,17 @@ from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist
 from rbl_gym.recordings.odometry import OdometryLog
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.epochs import stack_beliefs
+from rbl_gym.studies.groups import beliefs_of
 from rbl_gym.studies.replay.centre import about_origin, centred
 from rbl_gym.studies.replay.mirror import covering
 from rbl_gym.studies.replay.place import level_of, origin_of, own_std, start_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import (
     Track,
+    log_steps,
     prior_of,
     readings_of,
     recording_filter,
-    recording_steps,
     robust_of,
 )
 
@@ -170,8 +170,7 @@ def _starts(
     )
     settings = settings.changed(odometry_offset_s=0.0)
     filter = recording_filter(backwards, settings)
-    steps = recording_steps(backwards, settings, filter)
-    belief = stack_beliefs(step.belief for step in steps)
+    belief = beliefs_of(log_steps(backwards, settings, filter))
     yield belief.rotation[::-1], belief.translation[::-1]
     rotation, translation, _ = start_of(recording, settings)
     K = len(times)

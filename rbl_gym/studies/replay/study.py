@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym.recordings import TimeOffset
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.studies.replay.diagnosis import diagnose
 from rbl_gym.studies.replay.figures import smoothed_figures, track_figures
 from rbl_gym.studies.replay.judging import (
@@ -76,7 +76,7 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
 
 
 def replay_recording(
-    recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
+    recording: Recording, settings: Settings, advance: Advance = silent
 ) -> Replayed:
     """Track a recorded body causally, and compare the track with the truth if there is one.
 
@@ -87,7 +87,7 @@ def replay_recording(
     settings
         Settings of the filter.
     advance
-        Called after every epoch.
+        Called with the number of epochs done.
 
     Raises
     ------
@@ -133,17 +133,19 @@ def _offset_note(found: TimeOffset) -> list[str]:
 
 
 class _Stopwatch:
-    """Measure the processor time from one epoch to the next."""
+    """Measure the processor time from one report of progress to the next."""
 
-    def __init__(self, advance: Callable[[], None]) -> None:
+    def __init__(self, advance: Advance) -> None:
         self._advance = advance
-        self._ends = [time.process_time()]
+        self._ends, self._steps = [time.process_time()], []
 
-    def tick(self) -> None:
-        """Note the end of an epoch."""
+    def tick(self, steps: int = 1, *, more: int = 0) -> None:
+        """Note the end of some epochs."""
         self._ends.append(time.process_time())
-        self._advance()
+        self._steps.append(steps)
+        self._advance(steps, more=more)
 
     def microseconds(self) -> float:
         """Return the median time of an epoch; the first ones may include compilation."""
-        return 1e6 * float(np.median(np.diff(self._ends)))
+        each = np.repeat(np.diff(self._ends) / self._steps, self._steps)
+        return 1e6 * float(np.median(each))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -14,13 +14,14 @@ from rbl_gym import estimators, motion
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import Innovations
 from rbl_gym.estimators.filter import check_takes_noise
-from rbl_gym.estimators.level import hold_level
 from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings.inertial import samples_between
 from rbl_gym.recordings.odometry import odometry_between
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.epochs import Reading, Step, innovations_of, stack_beliefs, track_epochs
+from rbl_gym.studies.epochs import Reading, Step, track_epochs
+from rbl_gym.studies.groups import Steps, each, innovations_of, joined, track_log
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.studies.replay.centre import about_origin, centred
 from rbl_gym.studies.replay.inertial import clocked, standing
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
@@ -68,10 +69,9 @@ class Track(NamedTuple):
     at_centre: FloatArray | None = None
 
 
-def track_recording(
-    recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
-) -> Track:
-    """Filter a recording causally, epoch by epoch; `advance` is called after each.
+def track_recording(recording: Recording, settings: Settings, advance: Advance = silent) -> Track:
+    """Filter a recording causally, epoch by epoch; `advance` is called with the number of
+    epochs done.
 
     If a mirror pose explains the ranges equally well, the belief includes both (`replay.mirror`).
     A rotation that the ranges do not determine keeps a large variance (`replay.centre`).
@@ -83,17 +83,20 @@ def track_recording(
     return about_origin(track, centre)._replace(at_centre=track.covariance)
 
 
-def _tracked(recording: Recording, settings: Settings, advance: Callable[[], None]) -> Track:
+def _tracked(recording: Recording, settings: Settings, advance: Advance) -> Track:
     filter = recording_filter(recording, settings)
-    beliefs, found = [], []
-    steps = recording_steps(recording, settings, filter)
-    for group, innovations in innovations_of(
-        filter, _counted(steps, advance), recording.tags, _noise(settings)
-    ):
-        beliefs += [step.belief for step in group]
-        found.append(innovations)
-    foretold = Innovations(*map(np.concatenate, zip(*found, strict=True)))
-    track = Track(recording.times, *stack_beliefs(beliefs)[:3], innovations=foretold)
+    steps = _counted(log_steps(recording, settings, filter), advance)
+    beliefs, found = zip(
+        *(
+            (group.belief, innovations)
+            for group, innovations in innovations_of(
+                filter, steps, recording.tags, _noise(settings)
+            )
+        ),
+        strict=True,
+    )
+    belief, foretold = joined(beliefs), joined(found)
+    track = Track(recording.times, *belief[:3], innovations=foretold)
     known = settings.knowledge
     if known.planar or known.height_std_m is not None or known.tilt_std_deg is not None:
         # Known height, roll and pitch distinguish the two sides.
@@ -109,10 +112,10 @@ def _tracked(recording: Recording, settings: Settings, advance: Callable[[], Non
     return track._replace(covariance=covering(other, poses), other=other)
 
 
-def _counted(steps: Iterator[Step], advance: Callable[[], None]) -> Iterator[Step]:
+def _counted(steps: Iterator[Step | Steps], advance: Advance) -> Iterator[Step | Steps]:
     for step in steps:
         yield step
-        advance()
+        advance(step.count)
 
 
 def recording_steps(
@@ -124,17 +127,26 @@ def recording_steps(
     volume of the settings restarts from its mirror image, if that is inside. Map coordinates are
     taken relative to the anchors; beliefs are in world coordinates.
     """
+    for step in log_steps(recording, settings, filter):
+        yield from step.each() if isinstance(step, Steps) else (step,)
+
+
+def log_steps(
+    recording: Recording, settings: Settings, filter: estimators.Filter
+) -> Iterator[Step | Steps]:
+    """Yield the steps of `recording_steps`, of one epoch or of many (`epochs.track_log`)."""
     origin = origin_of(recording)
     local = recording._replace(anchors=recording.anchors - origin)
     volume = volume_of(recording, settings)
     volume = None if volume is None else volume - origin
     restart = None if volume is None else partial(_image_inside, recording.tags, volume)
-    level = level_of(settings, origin)
-    hold = None if level is None else partial(hold_level, level=level)
-    readings = _readings(local, settings)
     rotation, translation, covariance = prior_of(recording, settings)
-    prior = rotation, translation - origin, covariance
-    steps = track_epochs(filter, prior, readings, restart, hold)
+    how = (rotation, translation - origin, covariance), _log(local, settings)
+    rest = restart, level_of(settings, origin)
+    if recording.odometry is None and recording.inertial is None:
+        steps = track_log(filter, *how, *rest)
+    else:
+        steps = track_epochs(filter, how[0], _sensed(recording, settings, how[1]), *rest)
     if not origin.any():
         yield from steps
         return
@@ -143,22 +155,23 @@ def recording_steps(
         yield step._replace(belief=belief._replace(translation=belief.translation + origin))
 
 
-def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
-    """Yield the epochs of a recording."""
+def _log(recording: Recording, settings: Settings) -> Reading:
+    """Return the epochs of a recording, for `epochs.each`."""
     own = own_std(recording, settings)
-    elapsed = np.diff(recording.times, prepend=recording.times[0])
-    anchors = recording.anchors_by_epoch
-    complete = np.all(recording.links, axis=(1, 2)).tolist()
-    for k, dt in enumerate(elapsed.tolist()):
-        yield Reading(
-            recording.ranges[k],
-            anchors[k],
-            None if complete[k] else recording.links[k],
-            None if own is None else ranging.LinkNoise(own[k]),
-            np.zeros(6) if dt > 0 else None,
-            dt,
-            **sensed(recording, settings, recording.times[k] - dt, recording.times[k]),
-        )
+    return Reading(
+        recording.ranges,
+        recording.anchors_by_epoch,
+        recording.links,
+        None if own is None else ranging.LinkNoise(own),
+        np.zeros((len(recording.times), 6)),
+        np.diff(recording.times, prepend=recording.times[0]),  # pyright: ignore[reportArgumentType]
+    )
+
+
+def _sensed(recording: Recording, settings: Settings, log: Reading) -> Iterator[Reading]:
+    """Yield the epochs of a log with the readings of the body sensor."""
+    for time, reading in zip(recording.times.tolist(), each(log), strict=True):
+        yield reading._replace(**sensed(recording, settings, time - reading.dt, time))
 
 
 def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:

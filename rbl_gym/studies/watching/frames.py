@@ -10,7 +10,8 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, Innovations, PoseBelief, parse_filter
 from rbl_gym.measurements.ranging import NoiseLaw
-from rbl_gym.studies.epochs import Step, innovations_of, pose_errors
+from rbl_gym.studies.epochs import Step, pose_errors
+from rbl_gym.studies.groups import innovations_of
 
 __all__ = ["LINKS", "Frame", "Links", "Named", "Pose", "Tracked", "filter_named", "link_kinds"]
 
