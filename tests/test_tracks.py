@@ -152,10 +152,9 @@ def test_an_invalid_epoch_is_named_by_the_loop():
     log.ranges[20, 1, 2] = np.nan
     filter, seen = a_filter("iekf-bias", tags), []
     with pytest.raises(ValueError, match=r"ranges must be finite.*\(1, 2\)"):
-        for group in track_log(filter, prior, log):
-            seen.append(group)
+        seen.extend(track_log(filter, prior, log))
     assert sum(group.count for group in seen) == 20
-    state = type(seen[0].state)(*seen[0].state)
+    state = seen[0].state
     with pytest.raises(ValueError, match="dt must be finite"):
         filter.track(state, log.ranges[:3], log.anchors[:3], dt=[0, 1, np.nan])
 
