@@ -1,4 +1,4 @@
-"""An animated picture of an environment: frames of `render()`, written by Pillow.
+"""Write an animated picture of an environment: frames of `render()`, saved by Pillow.
 
 python examples/animate.py --scene drone_yard --filter iekf --steps 100 out/drone.webp
 """

@@ -1,4 +1,4 @@
-"""Write the log that `examples/log/` holds: a robot with 4 tags in a room with 8 anchors.
+"""Write the simulated log in `examples/log/`: a robot with 4 tags in a room with 8 anchors.
 
     python examples/simulate_log.py --out examples/log
 
