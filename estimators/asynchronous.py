@@ -2,8 +2,8 @@
 
 Radios measure one link after another, and a range may arrive after later ones. `Asynchronous` runs
 any filter of `rbl_gym.estimators.Filter` on such a stream. It predicts the state to the time of
-every range. If a range arrives out of order within a short window, it goes back and repeats the
-later updates. The result equals that of the ordered stream to the last bit.
+every range. If a range arrives out of order within a short window, `Asynchronous` goes back and
+repeats the later updates. The result equals that of the ordered stream to the last bit.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ class Asynchronous:
     filter
         Any filter.
     anchors
-        (M, 3), metres. If anchors move, these positions hold for ranges without `anchors`.
+        (M, 3), positions in metres. Each call of `add` may give other positions.
     n_tags
         Number of tags on the body.
     window_s
-        Greatest delay of a range behind the newest one, seconds.
+        How much older than the newest range a range may be, seconds.
 
     Example
     -------
@@ -131,16 +131,22 @@ class Asynchronous:
         std_m: float | None = None,
         anchors: ArrayLike | None = None,
     ) -> Stream:
-        """Return the stream with one more range, metres, (...) for bodies with the same times.
+        """Return the stream with one more range.
 
-        A range before the start, or before the newest by more than the window, is left out and
-        counted in `dropped`.
+        A range from before the start, or older than the newest range by more than the window, is
+        left out and counted in `dropped`.
 
         Parameters
         ----------
+        time
+            Time of the range, seconds.
+        anchor, tag
+            Indices of the link.
+        range
+            (...), metres; with leading axes for several bodies with the same times.
         twist
             (..., 6) of the interval that ends at this range. By default zero, a random walk; None
-            for a filter that estimates it.
+            for a filter that estimates the twist.
         noise
             Noise model of this range, for instance ``LinkNoise([[0.05]])``; None: the filter's.
         std_m
@@ -210,7 +216,7 @@ class Asynchronous:
     ) -> Any:
         """Return the filter's state at a time, seconds, at or after the newest range.
 
-        None: at the newest range.
+        `time` None: the time of the newest range.
         """
         newest = stream.checkpoints[-1]
         if time is None:

@@ -119,10 +119,11 @@ def make(
     ----------
     name
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
-        ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the entry-point group
-        ``rbl_gym.filters`` of another package; or ``"package.module:factory"``, which is imported.
-        Options may follow it, as in ``"iekf/robust=true"`` (`parse_filter`). Or a factory: a class
-        or a function with the arguments `tags`, `noise`, `process` and its own options.
+        ``"iekf-bias"``, ``"iekf-log"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the
+        entry-point group ``rbl_gym.filters`` of another package; or ``"package.module:factory"``,
+        which is imported. Options may follow the name, as in ``"iekf/robust=true"``
+        (`parse_filter`). Or a factory: a class or a function with the arguments `tags`, `noise`,
+        `process` and its own options.
     tags
         (N, 3), positions in the body frame, metres.
     noise

@@ -43,13 +43,13 @@ class Innovations(NamedTuple):
     Attributes
     ----------
     innovation, std
-        (..., M, N), metres: the range less its prediction, and the standard deviation that the
+        (..., M, N), metres: the range minus its prediction, and the standard deviation that the
         filter predicts for it; 0 without a link.
     residual
-        (..., M, N), metres: the range less that of the state after the update; 0 without a link.
+        (..., M, N), metres: the range minus that of the state after the update; 0 without a link.
     used
-        (..., M, N): the measured links without those rejected because their residual is beyond
-        `GATE` standard deviations of a range.
+        (..., M, N): the measured links, without the rejected ones. A link is rejected if its
+        residual is larger than `GATE` standard deviations of a range.
     nis
         Normalised innovation squared (...) of the ranges used. Its mean is `dof` if the filter is
         consistent. It is inf if a state is not finite.
@@ -87,8 +87,9 @@ def innovations(
         Any filter. A filter whose states bias the ranges has a method
         ``biases_of(state, anchors)``. It returns the states besides the pose (..., K), the
         covariance (..., 6 + K, 6 + K) of the errors of pose and states, and the derivative (M N, K)
-        of the ranges by the states. A filter whose ranges share an unknown offset has an attribute
-        ``offset``. NIS, likelihood and residuals are then those with the offsets removed.
+        of the ranges with respect to these states. A filter whose ranges share an unknown offset
+        has an attribute ``offset``. Then the offsets are removed from NIS, likelihood and
+        residuals.
     before, after
         Its states, as returned by `predict` and by `update`.
     ranges, anchors, links

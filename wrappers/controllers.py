@@ -1,9 +1,9 @@
-"""Reference policies of the tasks with a filter in the loop, to compare learned ones with.
+"""Reference policies for the tasks with a filter in the loop.
 
 A controller is a function ``(env, rng) -> actions`` of a vector environment with one scene. `rng`
-is the Generator of those that draw random numbers; the others do not use it. A controller reads
-the belief and the model, never the truth. Only `greedy_with_map` knows the positions of the racks.
-Those in `MOBILE` and `SELECTION` also accept families of scenes.
+is a Generator; controllers without random numbers do not use it. A controller reads the belief and
+the model, never the truth. Only `greedy_with_map` knows the positions of the racks. The controllers
+in `MOBILE` and `SELECTION` also accept families of scenes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ def random_velocities(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> 
 
 
 def ring(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Keep a ring around the estimate, its radius the vehicle's depth (two craft: a quarter)."""
+    """Keep the craft on a ring around the estimate, with radius `RING_DEPTHS` times the depth.
+
+    Two craft: `PAIR_RING_DEPTHS`.
+    """
     pair = env.scene.n_anchors == 2
     return _towards(env, _around(env, PAIR_RING_DEPTHS if pair else RING_DEPTHS, 0.0))
 
@@ -166,7 +169,7 @@ def nearest(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarr
 
 
 def greedy_blind(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Choose anchors greedily by the predicted belief, as if nothing blocked sight."""
+    """Choose anchors greedily by the predicted belief, as if nothing blocked the line of sight."""
     return greedy(env, np.ones((env.num_envs, env.scene.n_anchors)))
 
 

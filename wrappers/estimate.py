@@ -38,8 +38,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     vector environments use `VectorEstimatePose`.
 
     The wrapper replaces the reward. Wrappers between the environment and this one still see the
-    environment's own reward. If nobody needs the own reward, ``gym.make(..., reward="none")`` saves
-    the time to compute it.
+    reward of the environment. If no wrapper needs it, ``gym.make(..., reward="none")`` saves the
+    time to compute it.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Info
     ----
     `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees` (6 degrees of freedom) and
-    `score_m` (b of the belief), in addition to the environment's info. The environment's own
-    `score_m`, b of the bound, is renamed to `bound_m`.
+    `score_m` (b of the belief), in addition to the environment's info. The `score_m` of the
+    environment, b of the bound, gets the name `bound_m`.
 
     Examples
     --------

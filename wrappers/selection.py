@@ -203,8 +203,8 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`.
 
     `scenes`, instead of `scene`: a family of scenes, see `RBL/Tracking-v0`. M is then the largest
-    number of anchors. Anchors that a drawn scene does not have cannot be chosen. The observation
-    has 21 + 6 M entries:
+    number of anchors. Anchors that a drawn scene does not have are ignored if an action chooses
+    them. The observation has 21 + 6 M entries:
 
     * those above, with the position scaled to the volume of the drawn scene (18);
     * half sizes of that volume (3) and the anchors relative to the estimate (3 M), both divided by

@@ -198,7 +198,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return tuple(np.hstack(frames[i : i + k]) for i in range(0, len(frames), k))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the stack if there is one."""
+        """Close the environment of the bodies, if it was made."""
         if self.inner is not None:
             self.inner.close(**kwargs)
 
@@ -320,7 +320,7 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """Close the stack."""
+        """Close the environment."""
         self._one.close()
 
 

@@ -1,8 +1,8 @@
 """RBL/MobileAnchors-v0: craft move to improve the belief of a filter in the loop.
 
-`RBL/Tracking-v0`, `EstimatePose`, and a policy's view of both. The policy observes the belief, not
-the ranges, and its reward is the accuracy of the belief. `rbl_gym.wrappers.selection` works the
-same way.
+The environment consists of `RBL/Tracking-v0`, `EstimatePose`, and an observation for a policy. The
+policy observes the belief, not the ranges, and its reward is the accuracy of the belief.
+`rbl_gym.wrappers.selection` works the same way.
 """
 
 from __future__ import annotations

@@ -25,9 +25,9 @@ EMPTY = PoseState(
 class BankState(NamedTuple):
     """The leading hypothesis and K rivals, with leading batch axes.
 
-    `log_odds` (..., K) are those of each rival against the leader; minus infinity for an empty
-    slot. `nis` and `links` (...) are sums over a fading window, of squared whitened innovations and
-    of links.
+    `log_odds` (..., K) compares each rival with the leader; minus infinity for an empty slot. `nis`
+    (...) is the sum of the squared whitened innovations, and `links` (...) the number of links. In
+    both sums earlier epochs have smaller weights.
     """
 
     rotation: FloatArray

@@ -41,10 +41,11 @@ class AugmentedState(NamedTuple):
     rotation, translation
         (..., 3, 3) and (..., 3).
     extra
-        (..., K): the twist (6) if it is unknown, then the biases of the M N links, by anchors, of
-        one bias model after the other. There are no biases before the first ranges, which fix M.
+        (..., K): the twist (6) if it is unknown, then for each bias model the biases of the M N
+        links, in the order of the anchors. There are no biases before the first ranges, which fix
+        M.
     covariance
-        (..., 6 + K, 6 + K) of ``(w, v)`` and the extra states, estimate less truth.
+        (..., 6 + K, 6 + K) of ``(w, v)`` and the errors of the extra states, estimate minus truth.
     """
 
     rotation: FloatArray

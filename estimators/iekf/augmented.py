@@ -52,13 +52,13 @@ class AugmentedEkf:
     pose
         The filter of the pose: tags, noise, process, iterations, robustness.
     twist
-        Law of an unknown twist; None: the twist is known and passed to `predict`.
+        Law of an unknown twist. None: the twist is known and passed to `predict`.
     sensor
-        Noisy sensor of the twist; None: the twist passed to `predict` is ignored if unknown.
+        Noisy sensor of an unknown twist; `predict` then gets its readings. None: no sensor.
     biases
-        Laws of the link biases, which are added; empty: no biases.
+        Laws of the link biases. The bias of a link is the sum over all laws. Empty: no biases.
     directions
-        Range bias by ray direction, at the estimated pose; None: no such bias.
+        Bias of a range as a function of its direction, at the estimated pose. None: no such bias.
     """
 
     pose: IteratedEkf
@@ -108,8 +108,9 @@ class AugmentedEkf:
         Parameters
         ----------
         twist
-            (..., 6) of the interval. It is the known twist if this filter does not estimate one.
-            Otherwise it is the reading of the `sensor`, or None; without a sensor it is ignored.
+            (..., 6) of the interval: the known twist, if this filter does not estimate the twist.
+            With a `sensor`: its reading, or None without a reading. Ignored if the twist is
+            unknown and there is no sensor.
         """
         dt, state = check_number("dt", dt, low=0.0), plain(state)
         state, told = told_twist(self, state, twist)
@@ -315,10 +316,11 @@ class AugmentedEkf:
     def biases_of(
         self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return extra states, their covariance, and the derivative of the ranges by them.
+        """Return extra states, a covariance, and a derivative of the ranges.
 
-        The extra states are (..., K), the covariance of pose and extra states is (..., 6 + K, 6 +
-        K), and the derivative of the ranges to anchors (..., M, 3) is (M N, K).
+        The extra states are (..., K). The covariance (..., 6 + K, 6 + K) is that of pose and extra
+        states. The derivative (M N, K) of the ranges to anchors (..., M, 3) is with respect to the
+        extra states.
         """
         shape, count = (anchors.shape[-2], self.pose.tags.shape[-2]), len(self.biases)
         if self.biases:

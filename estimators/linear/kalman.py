@@ -103,8 +103,9 @@ class KalmanFamily:
         ``|Q^T Q - I|_F > threshold``; ``"always"`` KF-ortho, Section V: projection after every
         update. The next prediction starts from the projected rotation.
     sigma_q_scale
-        Ratio of the process noise of an entry of Q to that of the rotation. The paper prints 1;
-        with sqrt(2/3) the filter is consistent.
+        Ratio of the process noise of an entry of Q to that of the rotation. The paper prints 1.
+        With sqrt(2/3) the trace of the covariance of the nine entries is right; with sqrt(2) the
+        variance of a rotation angle is right (docs/leaderboard.md).
     threshold
         Threshold of the event-triggered filter.
     coupled

@@ -40,11 +40,22 @@ STEP_RULES = ("theorem", "best", "trace", "rows")
 
 
 class CycleExchange(NamedTuple):
-    """Communication of the cycles: order, and loss of messages."""
+    """Communication between the cycles of `cycle_iteration`.
 
-    order: str = "synchronous"  # or "asynchronous": one cycle at a time, in random order
-    rng: np.random.Generator | None = None  # for order and losses
-    loss: float = 0.0  # probability that a message is lost, so that the cycle's turn has no effect
+    Attributes
+    ----------
+    order
+        ``"synchronous"``: all cycles correct their edges at once. ``"asynchronous"``: one cycle at
+        a time, in random order.
+    rng
+        Generator for the order and the losses.
+    loss
+        Probability that a message is lost. Then the cycle makes no correction in its turn.
+    """
+
+    order: str = "synchronous"
+    rng: np.random.Generator | None = None
+    loss: float = 0.0
 
 
 class CycleRun(NamedTuple):

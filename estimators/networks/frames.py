@@ -36,11 +36,23 @@ _REWEIGHTINGS = 3
 
 
 class FrameEstimate(NamedTuple):
-    """Frames of all nodes in that of node 0 (orientation 0, at the origin)."""
+    """Orientations and positions of all nodes, in the frame of node 0.
 
-    orientations: FloatArray  # (n,) radians in [-pi, pi)
-    positions: FloatArray  # (n, 2) metres
-    cost: float  # sum of squared whitened residuals
+    Attributes
+    ----------
+    orientations
+        (n,), radians in [-pi, pi); 0 at node 0.
+    positions
+        (n, 2), metres; node 0 is the origin.
+    cost
+        Sum of squared whitened residuals.
+    converged
+        Whether the iteration converged.
+    """
+
+    orientations: FloatArray
+    positions: FloatArray
+    cost: float
     converged: bool
 
 

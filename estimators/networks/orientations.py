@@ -65,9 +65,9 @@ def orientations(
         (14), then along a tree. ``"tree"``: y along the breadth-first tree. ``"spectral"``:
         phases of the eigenvector of the connection Laplacian's smallest eigenvalue.
     weights
-        (m,) above 0: the information of each y, one over its variance, in any unit. None may be
-        below `LEAST_WEIGHT` of the largest, because of rounding. None: equal weights. Not for
-        ``"cycle"`` and ``"tree"``, which are unweighted.
+        (m,) above 0: the information of each y (1 / variance), in any unit. Every weight must be
+        at least `LEAST_WEIGHT` of the largest, because of rounding. None: equal weights. The
+        methods ``"cycle"`` and ``"tree"`` accept no weights.
     options
         Options of `cycle_consensus`, with ``"cycle"``.
 

@@ -21,12 +21,24 @@ _SMALLEST_SINE = 1e-9
 
 
 class TriangleFrames(NamedTuple):
-    """Frames of three nodes relative to that of node 0."""
+    """Orientations and positions of three nodes, in the frame of node 0.
 
-    rotation: FloatArray  # (..., 3, 3, 3) from each node's frame to node 0's
-    position: FloatArray  # (..., 3, 3) in node 0's frame, metres; NaN if no triangle fits
-    angle: FloatArray  # (..., 3) interior angles, radians, sum pi
-    misfit: FloatArray  # (...), pi less the sum of the measured angles: N(0, 6 sigma^2)
+    Attributes
+    ----------
+    rotation
+        (..., 3, 3, 3), from the frame of each node to the frame of node 0.
+    position
+        (..., 3, 3), metres; NaN if no triangle fits.
+    angle
+        (..., 3), interior angles of the triangle, radians; their sum is pi.
+    misfit
+        (...), pi minus the sum of the measured angles, with the distribution N(0, 6 sigma^2).
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+    angle: FloatArray
+    misfit: FloatArray
 
 
 def triangle_frames(bearings: ArrayLike, length_m: float = 1.0) -> TriangleFrames:

@@ -43,8 +43,8 @@ WORLD: dict[str, Any] = {
 def world(scene: Mapping[str, Any] | None) -> Scene:
     """Return the scene given by `WORLD` and these overrides.
 
-    ValueError if the scene does not have exactly one base station, or if it has links or obstacles,
-    which do not apply to angles.
+    Raises ValueError if the scene does not have exactly one base station, or if it has links or
+    obstacles, which do not apply to angles.
     """
     changes = {} if scene is None else scene
     if not isinstance(changes, Mapping):

@@ -145,10 +145,10 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     ## Description
     Every episode draws a problem: a work region, which is a box inside the scene's volume. In rooms
     it also draws up to two racks that block the line of sight, besides the scene's own obstacles.
-    The agent places M anchors on the scene's legal surfaces, those on which anchors may be. The
+    The agent places M anchors on the scene's legal surfaces, where anchors may be mounted. The
     score of a layout is the root mean square error of the tag positions in metres. It depends on
-    the errors of position and orientation. The Cramer-Rao bound predicts it for 32 fixed poses in
-    the region (`rbl_gym.placement.score`).
+    the errors of position and orientation. The Cramer-Rao bound predicts the score for 32 fixed
+    poses in the region (`rbl_gym.placement.score`).
 
     ## Action space
     * ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
@@ -178,8 +178,8 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     `Placing`. All observations are mirrored in the same way.
 
     ## Reward
-    ``-log score`` with the last anchor, and 0 before. With ``mode="mounts"`` every anchor is
-    rewarded by the decrease of the log score; the score without anchors counts as 3 m. With
+    ``-log score`` with the last anchor, and 0 before. With ``mode="mounts"`` the reward of every
+    step is the decrease of the log score; the score without anchors counts as 3 m. With
     ``gym.make(..., reward="filter")`` the reward is the accuracy of a filter (the wrapper
     `FilterReward`).
 
@@ -212,7 +212,7 @@ class AnchorPlacementEnv(PlacementScalarEnv):
 
     * `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. The fixed anchors of a building
       file keep their positions, and the agent places the others.
-    * `scenes`, instead of `scene`: a family of scenes, see below.
+    * `scenes`, instead of `scene`: a family of scenes, see `PlacementFamilyEnv`.
     * `mode`: ``"sequential"``, ``"one-shot"`` or ``"mounts"``, see the action space.
     * `racks`: number of racks in a room, 0 to 2.
     * `n_anchors`: number M of anchors to place; None for the default of
@@ -220,7 +220,7 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     * `mirror`: whether the environment mirrors the problems of symmetric scenes.
     * `sight`: whether to observe what each mount sees; only with racks or obstacles.
     * `observation`: ``"flat"``, ``"dict"``, ``"tokens"``, ``"module:function"`` or a function, see
-      below.
+      the observation space.
     * `reward`: ``"bound"`` or ``"filter"``.
     * `filter`, `options`: the filter with ``reward="filter"``, as in `EstimatePose`.
 

@@ -62,8 +62,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     ## Reward
     ``reward="bound"``: ``-log b``, where b is the posterior Cramer-Rao bound of the root mean
     square error of the tag positions in metres, at the true pose. This is the accuracy that the
-    best estimator can reach with these anchors and all of their ranges. ``reward="none"``: 0, and
-    no bound is computed. This saves time if a wrapper gives the reward.
+    best estimator can reach with all ranges so far. ``reward="none"``: 0, and no bound is computed.
+    This saves time if a wrapper computes the reward.
 
     ## Starting state
     A reset draws the start pose, way-points, turn rate, and the anchors that the scene does not
@@ -130,7 +130,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     M and N are then the largest numbers of anchors and tags in the family. If the drawn scene has
     fewer, the remaining rows and links are zeros. The observation has three more keys:
     `anchor_mask` (M,) and `tag_mask` (N,), int8, 1 for existing anchors and tags; `tags` (N, 3),
-    metres, body frame. It has `quality` if any scene has obstacles.
+    metres, body frame. The observation has `quality` if any scene has obstacles.
 
     `info["scene"]` of the reset has the drawn overrides as JSON text. `env.unwrapped.scene` is the
     scene of the episode. Actions move only existing anchors. If no scene of the family has movable
