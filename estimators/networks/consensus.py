@@ -42,15 +42,9 @@ STEP_RULES = ("theorem", "best", "trace", "rows")
 class CycleExchange(NamedTuple):
     """Communication between the cycles of `cycle_iteration`.
 
-    Attributes
-    ----------
-    order
-        ``"synchronous"``: all cycles correct their edges at once. ``"asynchronous"``: one cycle at
-        a time, in random order.
-    rng
-        Generator for the order and the losses.
-    loss
-        Probability that a message is lost. Then the cycle makes no correction in its turn.
+    With `order` ``"synchronous"`` all cycles correct their edges at once; with ``"asynchronous"``
+    one cycle at a time, in random order. `rng` draws the order and the losses. `loss` is the
+    probability that a message is lost; then the cycle makes no correction in its turn.
     """
 
     order: str = "synchronous"
