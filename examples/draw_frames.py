@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("out")
     path = parser.parse_args().out
     figure = plt.figure(figsize=(9, 5), dpi=120)
-    axes = figure.add_axes((0, 0, 1, 1), projection="3d", computed_zorder=False)
+    axes = figure.add_axes((0, -0.4, 1, 1.8), projection="3d", computed_zorder=False)
     places = ranging.tag_positions(ROTATION, TRANSLATION, TAGS)
 
     draw_frame(axes, np.zeros(3), np.eye(3), 1.2, "w")
@@ -60,10 +60,10 @@ def main() -> None:
     axes.set_xlim(0, 6)
     axes.set_ylim(0, 4.5)
     axes.set_zlim(0, 3.2)
-    axes.set_box_aspect((6, 4.5, 3.2), zoom=1.2)
+    axes.set_box_aspect((6, 4.5, 3.2), zoom=0.9)
     axes.view_init(elev=26, azim=-70)
     axes.set_axis_off()
-    axes.legend(frameon=False, loc="upper left")
+    figure.legend(frameon=False, loc="upper left")
     figure.savefig(path)
 
 
