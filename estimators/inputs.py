@@ -13,6 +13,7 @@ from rbl_gym.checks import (
     HUGE,
     BoolArray,
     FloatArray,
+    at,
     check_array,
     check_finite,
     check_links,
@@ -99,6 +100,10 @@ def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArra
     return covariance
 
 
+# What to do about a link without a range.
+_NO_RANGE = "if the link has no range, set it to False in links"
+
+
 def check_epoch(
     ranges: ArrayLike,
     anchors: ArrayLike,
@@ -136,7 +141,7 @@ def check_epoch(
             mask = None
     check_batches(ranges=ranges.shape[:-2], anchors=anchors.shape[:-2])
     if signed:
-        check_finite("ranges", ranges)
+        check_finite("ranges", ranges, _NO_RANGE)
     else:
         check_ranges(ranges, mask)
     return ranges, anchors, mask
@@ -215,11 +220,11 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
     """Raise ValueError if a range behind a True link is NaN, infinite or not positive."""
     if links is None and are_positive(ranges):
         return
-    check_finite("ranges", ranges)
+    check_finite("ranges", ranges, _NO_RANGE)
     wrong = ranges <= 0 if links is None else (ranges <= 0) & links
     if wrong.any():
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
-        raise ValueError(f"ranges must be positive where measured, got {ranges[index]} at {index}")
+        raise ValueError(f"ranges must be positive where measured, got {ranges[index]}{at(index)}")
 
 
 def are_positive(values: FloatArray) -> bool:

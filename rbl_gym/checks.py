@@ -134,8 +134,11 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
         raise ValueError(f"{name} must be an array, got {value!r:.80}") from error
 
 
-def check_finite(name: str, array: FloatArray) -> FloatArray:
-    """Return `array` unchanged, or raise ValueError with the first NaN, inf or `HUGE` entry."""
+def check_finite(name: str, array: FloatArray, advice: str = "") -> FloatArray:
+    """Return `array` unchanged, or raise ValueError with the first NaN, inf or `HUGE` entry.
+
+    The message of a NaN or inf ends with the `advice`, a text that says what to do instead.
+    """
     # The sum of squares suffices for most arrays, in one pass; False for NaN too. For larger ones
     # BLAS would split the sum over threads, whose start takes longer.
     if array.size <= _ONE_THREAD and np.vdot(array, array) < HUGE:
@@ -144,11 +147,18 @@ def check_finite(name: str, array: FloatArray) -> FloatArray:
         if np.isfinite(array).all():
             index = tuple(int(i) for i in np.argwhere(np.abs(array) >= HUGE)[0])
             raise ValueError(
-                f"{name} must be below {HUGE:g} in magnitude, got {array[index]} at index {index}"
+                f"{name} must be below {HUGE:g} in magnitude, got {array[index]}{at(index)}"
             )
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name} must be finite, got {array[index]} at index {index}")
+        raise ValueError(
+            f"{name} must be finite, got {array[index]}{at(index)}{advice and '; '}{advice}"
+        )
     return array
+
+
+def at(index: tuple[int, ...]) -> str:
+    """Return ``" at index (1, 2)"``, or ``""`` for the only entry of an array without axes."""
+    return f" at index {index}" if index else ""
 
 
 def all_finite(figures: Any) -> bool:
@@ -230,7 +240,10 @@ def check_count(name: str, value: Any, *, least: int = 1, most: int | None = Non
 def check_generator(name: str, rng: Any) -> np.random.Generator:
     """Return `rng` if it is a random generator, or raise ValueError with its name."""
     if not isinstance(rng, np.random.Generator):
-        raise ValueError(f"{name} must be a numpy.random.Generator, got {rng!r:.80}")
+        raise ValueError(
+            f"{name} must be a numpy.random.Generator, such as numpy.random.default_rng(1), got "
+            f"{rng!r:.80}"
+        )
     return rng
 
 
@@ -253,8 +266,11 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
     if mask.dtype != np.bool_:
         measured = mask != 0
         if mask.dtype.kind not in "iuf" or (measured != mask).any():
-            wrong = mask.ravel() if mask.dtype.kind not in "iuf" else mask[measured != mask]
-            raise ValueError(f"links must be True (measured) or False, got {wrong[0]!s:.80}")
+            wrong = measured != mask if mask.dtype.kind in "iuf" else np.ones(mask.shape, bool)
+            index = tuple(int(i) for i in np.argwhere(wrong)[0])
+            raise ValueError(
+                f"links must be True (measured) or False, got {mask[index]!s:.80}{at(index)}"
+            )
         mask = measured
     return mask
 

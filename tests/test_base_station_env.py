@@ -148,13 +148,20 @@ def test_a_drawn_episode_equals_that_of_its_scene_alone():
     ("arguments", "named"),
     [
         ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must be left out if scenes is given"),
-        ({"scenes": ["hall"]}, r"scenes\[0\] must be a dict of changes, got 'hall'"),
+        ({"scene": {"n_anchors": 4}}, "scene must have n_anchors = 1, the base station, got 4"),
+        (
+            {"scenes": ["hall"]},
+            r"scenes\[0\] must be a dict with changes of the default world, got 'hall'",
+        ),
         ({"scenes": []}, "scenes must hold at least one scene"),
         (
             {"scenes": [{}, {"tags": [[0, 0, 0]]}]},
             r"the same number of tags, .*; got \[1, 4\] tags",
         ),
-        ({"scenes": {"n_anchors": 2, "anchors": None}}, "scene must have n_anchors = 1, got 2"),
+        (
+            {"scenes": {"n_anchors": 2, "anchors": None}},
+            "scene must have n_anchors = 1, the base station, got 2",
+        ),
     ],
 )
 def test_wrong_families_are_named(arguments, named):

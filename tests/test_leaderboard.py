@@ -400,7 +400,7 @@ def test_a_file_takes_one_run_unless_it_is_replaced(tmp_path, short, capsys):
     assert rows(other)[0]["tags_m"] != rows(first)[0]["tags_m"]
     (tmp_path / "x.jsonl").write_text("not a record\n{}\n")
     assert bench(tmp_path, *options)[0] == 2
-    assert "line 1: not a record of rbl-gym bench" in capsys.readouterr().err
+    assert "line 1: not a result of rbl-gym bench" in capsys.readouterr().err
 
 
 def test_records_say_what_they_are_of_and_times_stand_apart(tmp_path, short, capsys):
@@ -455,7 +455,7 @@ def test_rerun_gives_the_same_and_says_what_differs(tmp_path, short, capsys):
 def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
     (tmp_path / "empty.jsonl").write_text("")
     assert main(["rerun", str(tmp_path / "empty.jsonl")]) == 2
-    assert "must have a record" in capsys.readouterr().err
+    assert "must have results of rbl-gym bench" in capsys.readouterr().err
 
 
 def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys, monkeypatch):

@@ -183,7 +183,7 @@ def test_process_noise_from_lists_is_hashable_and_equal_to_that_from_tuples():
         ([0.1, -0.2, 0.3], "must not be negative, got [0.1, -0.2, 0.3]"),
         ([0.1, 0.2], "must be one number or three, got shape (2,)"),
         (np.ones((4, 2)), "must be one number or three, got shape (4, 2)"),
-        (np.nan, "must be finite, got nan at index ()"),
+        (np.nan, "must be finite, got nan"),
         ("0.1", "must be an array of real numbers, got '0.1'"),
     ],
 )

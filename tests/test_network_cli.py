@@ -236,7 +236,10 @@ def test_network2009_takes_points_footprints_and_a_variance(small, tmp_path, cap
     assert "footprint must connect all 5 points, got 5" in capsys.readouterr().err
     points.write_text("x,y\n0,0\n1,a\n")
     assert main(arguments) == 2
-    assert "must have two numbers a line" in capsys.readouterr().err
+    assert "line 3: must be two numbers x,y, got '1,a'" in capsys.readouterr().err
+    points.write_text("x,y\n0,0\n1,2\n")
+    assert main(arguments) == 2
+    assert "must have three points or more, got 2" in capsys.readouterr().err
     points.write_text("0,0\n1,1\n2,0\n")
     assert main(arguments) == 2
     assert "must have the header x,y" in capsys.readouterr().err

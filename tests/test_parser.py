@@ -33,6 +33,14 @@ def said(capsys, *arguments):
         (["replay", *FILES, "--height-m", "1"], "--height-m needs --height-std-m, its"),
         (["replay", *FILES, "--plot", "x.foo"], "--plot: must end in one of .png, .*'x.foo'"),
         (["place", "--scene", "uwb_rom"], "--scene must be one of .* did you mean 'uwb_room'"),
+        (["replay", *FILES, "--height-m", "1"], ".*; or set --planar, with which the height is"),
+        (["bench", "--filters", "iekf,ikef"], "--filters: filter must be one of .* mean 'iekf'"),
+        (["bench", "--conditions", "nlso"], "--conditions: condition must be .* mean 'nlos'"),
+        (["evaluate", "mounts", "--references", "rign"], "--references: reference must be one of"),
+        # The progress has begun when the error is found.
+        (["bounds", "--scene", "hal"], "--scene must be one of .* did you mean 'hall'"),
+        (["place", "uwb_room", "--fewest"], "--fewest needs a requirement"),
+        (["place", "uwb_room", "--anchors", "x"], "--anchors: must be N or A..B, .* got 'x'"),
         (["plac"], "did you mean 'place'"),
         (["train", "uwb_rom"], "did you mean 'uwb_room'"),
     ],
@@ -54,6 +62,9 @@ def test_files_columns_and_values_keep_their_names():
     assert cli.with_options("relative needs carrier; set planar", given, []) == (
         "relative needs --carrier; set --planar"
     )
+    replay = cli._parser("replay").parse_args(["replay", "--ranges", "x.csv"])
+    told = cli.with_options("imu needs the filter iekf-imu: leave out filter or imu", replay, [])
+    assert told == "imu needs the filter iekf-imu: leave out --filter or --imu"
     told = cli.with_options("ranges or bias_m must be given", given, ["calibrate", "--ranges=x"])
     assert told == "--ranges or --bias-m must be given"
 

@@ -49,7 +49,7 @@ def test_the_requirement_that_decides_and_the_distance_of_the_tags_that_meets_it
     (note,) = deciding_notes({"zones": [row], "tags_m": problem.tags.tolist()})
     assert note.startswith("The heading decides in zone 'hall': at 90 % of the positions ")
     needed = 0.6 * decides["value"] / 2
-    assert f"in place of 0.60 m, it would have to be about {needed:.2f} m" in note
+    assert f"that distance would have to be about {needed:.2f} m instead of 0.60 m" in note
     # With that distance the error is the limit: the rule holds to 5 %.
     tags = [[needed / 2, 0, 0], [-needed / 2, 0, 0]]
     wider = scene_files.of_mapping(HALL | {"body": {"tags": tags}})

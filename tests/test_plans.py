@@ -225,7 +225,7 @@ def test_layers_are_mapped_by_patterns_the_first_that_matches():
     ("text", "message"),
     [
         ("walls ,material=brick", "LAYER,KEY=VALUE"),
-        ("walls A,colour=red", "'colour=red' must be KEY=VALUE, each key once; keys: material"),
+        ("walls A,colour=red", "unknown key 'colour'; the keys are material"),
         ("walls A,low_m=high", "low_m must be a number, got 'high'"),
         ("walls A,material=cheese", "material must be one of drywall, .* information=SHARE"),
     ],

@@ -146,9 +146,12 @@ def test_truth_files(tmp_path):
 
 # What is wrong, the files that differ from the good ones, what the message says.
 ERRORS = {
-    "empty": ({"ranges": ""}, r"ranges.csv: must have the names of the columns and rows"),
-    "only comments": ({"tags": "# none\n\n"}, r"tags.csv: must have the names of the columns"),
-    "header only": ({"anchors": "anchor,x,y,z\n"}, r"anchors.csv: must have rows below the names"),
+    "empty": ({"ranges": ""}, r"ranges.csv: the file is empty; it must have a header"),
+    "only comments": (
+        {"tags": "# none\n\n"},
+        r"tags.csv: the file is empty; it must have a header",
+    ),
+    "header only": ({"anchors": "anchor,x,y,z\n"}, r"anchors.csv: must have rows below the header"),
     "binary": ({"ranges": b"\x93NUMPY\x01\x00"}, r"ranges.csv: must be UTF-8 text, .* at byte 0"),
     "utf-16": ({"tags": TAGS.encode("utf-16")}, r"tags.csv: must be UTF-8 text"),
     "zeros": (

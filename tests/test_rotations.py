@@ -304,7 +304,8 @@ def test_good_rotations_pass(shape):
     [
         (
             1.001 * np.eye(3),
-            "start must be orthogonal, but Q Q^T differs from the identity by 0.002",
+            "start must be orthogonal (a rotation matrix), but start times its transpose differs "
+            "from the identity by 0.002",
         ),
         (np.stack([np.eye(3), np.diag([1, 1, -1])]), "start must be a proper rotation"),
         (np.eye(4), "start must have shape (..., 3, 3), got (4, 4)"),

@@ -92,8 +92,8 @@ def test_masks_restart_only_some_worlds():
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"bodies": []}, "bodies must be a list of dicts of overrides, got"),
-        ({"bodies": [3]}, r"bodies\[0\] must be a dict of overrides, got 3"),
+        ({"bodies": []}, "bodies must be a list of dicts, .*; got"),
+        ({"bodies": [3]}, r"bodies\[0\] must be a dict of changes of the scene, got 3"),
         ({"bodies": [{}, {"dt": 0.5}]}, r"bodies\[1\] must have the dt of the others, got 0.5"),
         ({"bodies": [{}, {"n_anchors": 3}]}, r"bodies\[1\] must have the n_anchors"),
         ({"scene": 3}, "scene must be a name or a dict"),

@@ -221,7 +221,9 @@ def named_filter(
     told = dict(filter)
     name = told.pop("name", None)
     if not isinstance(name, str) and not callable(name):
-        raise ValueError(f"filter must be a name, or a dict with a name, got {filter!r:.80}")
+        raise ValueError(
+            f"filter must be a name, or a dict with the key 'name', got {filter!r:.80}"
+        )
     return parse_filter(name, told)
 
 

@@ -171,5 +171,5 @@ def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
     if value.shape != shape:
         raise ValueError(f"reward must return shape {shape}, got {value.shape}")
     if not all_finite(value):
-        raise ValueError(f"reward must be finite, got {value!r:.80}")
+        raise ValueError(f"reward must be finite, got {value!s:.80}")
     return value

@@ -328,12 +328,17 @@ def family_of_bodies(scene: Any, bodies: Any) -> SceneFamily:
     """Return the scenes of the bodies as a family, after a check that they can share anchors."""
     base = {"name": scene} if isinstance(scene, str) else scene
     if not isinstance(base, Mapping):
-        raise ValueError(f"scene must be a name or a dict of overrides, got {scene!r:.80}")
+        raise ValueError(f"scene must be a name or a dict of changes, got {scene!r:.80}")
     if not isinstance(bodies, Sequence) or isinstance(bodies, str) or not bodies:
-        raise ValueError(f"bodies must be a list of dicts of overrides, got {bodies!r:.80}")
+        raise ValueError(
+            "bodies must be a list of dicts, the changes of the scene for each body, such as "
+            f"[{{}}, {{'speed_m_s': 2}}]; got {bodies!r:.80}"
+        )
     for index, body in enumerate(bodies):
         if not isinstance(body, Mapping):
-            raise ValueError(f"bodies[{index}] must be a dict of overrides, got {body!r:.80}")
+            raise ValueError(
+                f"bodies[{index}] must be a dict of changes of the scene, got {body!r:.80}"
+            )
     merged = tuple({**base, **body} for body in bodies)
     made = [scenes.get(one) for one in merged]
     for index, one in enumerate(made):

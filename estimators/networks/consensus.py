@@ -217,8 +217,8 @@ def _solves(C: sp.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
 def _contradiction(branch: NDArray[Any]) -> str:
     named = np.rint(branch).astype(int).tolist()
     return (
-        f"branch must be rint(C psi / 2 pi) of some angles psi, got {named!s:.80}, which no angles "
-        "have, as the cycles are dependent; with independent cycles any branch is possible"
+        f"branch must be rint(C psi / 2 pi) for some angles psi, and no angles give {named!s:.80}, "
+        "as the cycles are linearly dependent; independent cycles (cycles='bfs') take any branch"
     )
 
 

@@ -133,7 +133,7 @@ def _rerun(options: argparse.Namespace) -> int:
     path = Path(options.file)
     records = bench_files.read_records(path)
     if not records:
-        raise ValueError(f"{path}: must have a record of rbl-gym bench, has none")
+        raise ValueError(f"{path}: must have results of rbl-gym bench (--out), has none")
     with progress("rerun", len(records)) as advance:
         result = bench_files.rerun(records, workers=workers, advance=advance)
     if write_json(result, options.json):
@@ -145,7 +145,9 @@ def _rerun(options: argparse.Namespace) -> int:
 
 def _workers(options: argparse.Namespace) -> backends.Workers:
     if options.address and options.backend not in ("dask", "ray"):
-        raise ValueError(f"--address needs --backend dask or ray, got {options.backend}")
+        raise ValueError(
+            f"--address needs --backend dask or ray, got {options.backend or 'no --backend'}"
+        )
     workers = backends.Workers(options.jobs, options.backend, options.address)
     backends.check(workers)
     return workers

@@ -67,9 +67,13 @@ def with_options(message: str, given: argparse.Namespace, arguments: Sequence[st
     names = [name for name in vars(given) if "_" in name]
     words = "|".join(name for name in vars(given) if "_" not in name)
     typed = {argument.partition("=")[0] for argument in arguments}
-    if f"--{message.partition(' ')[0]}" in typed:
+    first = message.partition(" ")[0]
+    if f"--{first}" in typed:
         message = f"--{message}"
-    message = re.sub(rf"\b(needs|set) ({words})\b", r"\1 --\2", message)
+    elif f"--{first}s" in typed:  # an option that takes a list
+        message = f"--{first}s: {message}"
+    message = re.sub(rf"\b(needs|set|leave out) ({words})\b", r"\1 --\2", message)
+    message = re.sub(rf"(--[\w-]+ or) ({words})\b", r"\1 --\2", message)
     for name in names:
         option = f"--{name.replace('_', '-')}"
         message = re.sub(rf"(?<![\w'\"./\[-]){name}(?![\w'\"./=])", option, message)

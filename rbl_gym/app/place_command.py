@@ -215,9 +215,14 @@ def _kept(names: str | None, layout: Any) -> tuple[int, ...]:
 def _numbers(text: str) -> range:
     """Parse N or A..B as a range."""
     first, dots, last = text.partition("..")
-    numbers = range(positive(first), positive(last if dots else first) + 1)
+    try:
+        numbers = range(positive(first), positive(last if dots else first) + 1)
+    except argparse.ArgumentTypeError:
+        numbers = range(0)
     if not numbers:
-        raise argparse.ArgumentTypeError(f"must be N or A..B with A at most B, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"must be N or A..B, positive whole numbers with A at most B, got {text!r}"
+        )
     return numbers
 
 

@@ -58,8 +58,8 @@ def _spacing(result: dict[str, Any], factor: float) -> str:
         return ""
     return (
         " The error of the heading is about inversely proportional to the distance between the "
-        f"tags: with these anchors, in place of {span:.2f} m, it would have to be about "
-        f"{span * factor:.2f} m. More anchors help less: twice the distance is worth about "
+        f"tags: with these anchors that distance would have to be about {span * factor:.2f} m "
+        f"instead of {span:.2f} m. More anchors help less: twice the distance is worth about "
         "four times as many anchors."
     )
 

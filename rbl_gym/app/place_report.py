@@ -65,9 +65,12 @@ def verdict(result: dict[str, Any]) -> str:
         return f"{text} This is the least number that was allowed."
     count = less["n_anchors"]
     if fewest["proved"]:
-        return f"{text} The least number: no choice of {count} passes."
+        return f"{text} This is the least number: no layout of {count} anchors passes."
     searches = f"{fewest['searches']} search{'es' if fewest['searches'] > 1 else ''}"
-    return f"{text} The least number found: {searches} found no layout of {count} that passes."
+    return (
+        f"{text} This is the least number found: {searches} found no layout of {count} anchors "
+        "that passes."
+    )
 
 
 def notes(result: dict[str, Any]) -> list[str]:

@@ -101,6 +101,9 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
             yield advance
         except BaseException:
             bar.live.transient = True  # no unfinished bar above the error
+            if not bar.console.is_interactive:  # nor the empty line that ends a bar in a file
+                bar.live.stop()
+                bar.disable = True
             raise
         bar.update(task, completed=done, total=total)
 
@@ -117,9 +120,11 @@ def _plain_progress(label: str, total: int) -> Iterator[Advance]:
             shown = percent
             print(f"\r{label} {done}/{total}", end="", file=sys.stderr, flush=True)
 
-    yield advance
-    if shown:
-        print(file=sys.stderr)
+    try:
+        yield advance
+    finally:
+        if shown:
+            print(file=sys.stderr)
 
 
 def write_json(result: dict[str, Any], target: str | None) -> bool:

@@ -21,6 +21,7 @@ from rbl_gym.checks import FloatArray, check_array, check_links, check_number, c
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets, ranging
+from rbl_gym.measurements.noise_laws import check_law
 
 __all__ = ["lift", "range_information", "range_jacobian", "tag_jacobian"]
 
@@ -131,8 +132,7 @@ def range_information(
     tags = check_array("tags", tags, ("N", 3))
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
-    if not callable(getattr(noise, "variance", None)):
-        raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
+    check_law("noise", noise, ("variance",))
     mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
     if model == "raw" and tag_std_m == 0:
         return information_at(anchors, tags, rotation, translation, noise, mask, offset, anchor_std)

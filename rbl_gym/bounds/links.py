@@ -22,6 +22,7 @@ from rbl_gym.checks import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.noise_laws import check_law
 
 __all__ = ["expected_information", "nlos_efficiency", "realised_crb"]
 
@@ -208,7 +209,6 @@ def _distances(
 
 
 def _check_laws(noise: Any, link_model: Any = _ALL_MEASURE) -> None:
-    if not callable(getattr(noise, "variance", None)):
-        raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
+    check_law("noise", noise, ("variance",))
     if not isinstance(link_model, ranging.LinkModel):
         raise ValueError(f"link_model must be a ranging.LinkModel, got {link_model!r:.80}")

@@ -28,6 +28,7 @@ from rbl_gym.checks import (
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.measurements.noise_laws import check_law
 from rbl_gym.measurements.ranging import NoiseLaw
 
 __all__ = [
@@ -69,10 +70,7 @@ class RangeEpoch(NamedTuple):
         tags = check_array("tags", self.tags, ("N", 3))
         rotation = rotations.check_rotation("rotation", self.rotation)
         translation = check_array("translation", self.translation, (3,))
-        if not callable(getattr(self.noise, "variance", None)):
-            raise ValueError(
-                f"noise must be a noise law of rbl_gym.ranging, got {self.noise!r:.80}"
-            )
+        check_law("noise", self.noise, ("variance",))
         mask = check_links(self.links, (anchors.shape[-2], tags.shape[-2]))
         return RangeEpoch(anchors, tags, rotation, translation, self.noise, mask)
 

@@ -48,14 +48,21 @@ def world(scene: Mapping[str, Any] | None) -> Scene:
     """
     changes = {} if scene is None else scene
     if not isinstance(changes, Mapping):
-        raise ValueError(f"scene must be a dict of changes, got {scene!r:.80}")
+        raise ValueError(
+            f"scene must be a dict with changes of the default world, such as {{'dt': 0.5}}, got "
+            f"{scene!r:.80}"
+        )
+    if changes.get("n_anchors", 1) != 1:
+        raise ValueError(
+            f"scene must have n_anchors = 1, the base station, got {changes['n_anchors']!r:.80}"
+        )
     return checked_world(scenes.get({**WORLD, **changes}))
 
 
 def checked_world(found: Scene) -> Scene:
     """Return the scene; raises ValueError as `world` does."""
     if found.n_anchors != 1:
-        raise ValueError(f"scene must have n_anchors = 1, got {found.n_anchors}")
+        raise ValueError(f"scene must have n_anchors = 1, the base station, got {found.n_anchors}")
     if found.links != LinkModel() or found.weakens:
         raise ValueError(
             "scene must have no failing links and no obstacles: angles are measured in every step"
@@ -68,7 +75,10 @@ def family_of_worlds(members: Any) -> SceneFamily:
     changes = families.members_of(members)
     for index, change in enumerate(changes):
         if not isinstance(change, Mapping):
-            raise ValueError(f"scenes[{index}] must be a dict of changes, got {change!r:.80}")
+            raise ValueError(
+                f"scenes[{index}] must be a dict with changes of the default world, got "
+                f"{change!r:.80}"
+            )
     found = SceneFamily(tuple({**WORLD, **change} for change in changes))
     counts = {len(checked_world(one).tags) for one in found.corners}
     if len(counts) > 1:

@@ -257,7 +257,8 @@ def check_actions(
     if array.shape != shape or array.dtype.kind not in ("iub" if whole else "fiub"):
         kind = "integers" if whole else "numbers"
         raise ValueError(
-            f"{name} must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
+            f"{name} must be {kind} of shape {shape}, got shape {array.shape} and dtype "
+            f"{array.dtype}"
         )
     # One product usually shows that all values are finite. It may overflow.
     if array.dtype.kind == "f" and not (

@@ -42,9 +42,12 @@ class PlacementFamilyVectorEnv(PlacementBatchEnv):
         self._check_flags(mode, mirror, sight)
         corners = self.family.corners
         if self.sight and not all(isinstance(t.scene.anchor_region, Walls) for t in corners):
+            names = sorted(
+                {t.scene.name for t in corners if not isinstance(t.scene.anchor_region, Walls)}
+            )
             raise ValueError(
-                "scenes must be rooms with walls, as mode='mounts' and sight=True use their "
-                "mount points"
+                "scenes must be rooms with walls, as mode='mounts' and sight=True use their mount "
+                f"points; got {', '.join(names)}"
             )
         m, k = self.family.most_anchors, self.family.most_boxes
         self._plan(corners[0], m, 6 + 7 * k + DESCRIBED + m)

@@ -336,7 +336,8 @@ def check_rotation(name: str, Q: ArrayLike, *, tolerance: float = ORTHOGONAL) ->
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(initial=0.0)
     if defect > tolerance:
         raise ValueError(
-            f"{name} must be orthogonal, but Q Q^T differs from the identity by {defect:.3g}"
+            f"{name} must be orthogonal (a rotation matrix), but {name} times its transpose "
+            f"differs from the identity by {defect:.3g}"
         )
     if (np.linalg.det(Q) < 0).any():
         raise ValueError(f"{name} must be a proper rotation, got a reflection (determinant -1)")

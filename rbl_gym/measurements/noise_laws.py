@@ -346,13 +346,16 @@ def law_of(numbers: FloatArray) -> NoiseLaw:
     return RangeNoise(first, second, None if reference < 0 else int(reference))
 
 
-def check_law(name: str, noise: Any) -> None:
-    """Raise ValueError if an object does not have the methods of `NoiseLaw`."""
-    methods = ("variance", "squared_range_variance", "sample")
+def check_law(
+    name: str,
+    noise: Any,
+    methods: tuple[str, ...] = ("variance", "squared_range_variance", "sample"),
+) -> None:
+    """Raise ValueError if an object does not have the methods of `NoiseLaw`, or these of them."""
     if not all(callable(getattr(noise, method, None)) for method in methods):
         raise ValueError(
-            f"{name} must be a noise law such as ranging.RangeNoise(floor_m=0.1), with the methods "
-            f"{', '.join(methods)}; got {noise!r:.80}"
+            f"{name} must be a noise law such as ranging.RangeNoise(floor_m=0.1), with the method"
+            f"{'s' * (len(methods) > 1)} {', '.join(methods)}; got {noise!r:.80}"
         )
 
 

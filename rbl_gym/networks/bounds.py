@@ -347,6 +347,6 @@ def space_orientation_covariance(
     if values[-1] < 1e-9 * values[0]:
         raise ValueError(
             "edges must determine all orientations at these positions, but "
-            f"{int((values < 1e-9 * values[0]).sum())} motions remain free"
+            f"{int((values < 1e-9 * values[0]).sum())} motions remain free: add edges"
         )
     return sigma**2 * np.linalg.inv(known.T @ known)[3 * (n_nodes - 1) :, 3 * (n_nodes - 1) :]

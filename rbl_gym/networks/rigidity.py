@@ -92,7 +92,7 @@ def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
     rank, full = parallel_rigidity_rank(positions, edges)
     if rank < full:
         raise ValueError(
-            f"edges must make the network parallel rigid, which takes rank {full}; got rank {rank}"
+            f"edges must make the network parallel rigid (rank {full}), got rank {rank}: add edges"
         )
 
 
@@ -109,8 +109,8 @@ def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> No
     missing = _null_dimension(sp.csr_matrix(J)) - 3
     if missing:
         raise ValueError(
-            f"edges and ranges must determine all frames, which takes rank {full}; got rank "
-            f"{full - missing}"
+            f"edges and ranges must determine all frames (rank {full}), got rank {full - missing}: "
+            "add edges or ranges"
         )
 
 

@@ -114,8 +114,8 @@ def task_family(value: Any, n_anchors: int | None = None, racks: int = 0) -> Tas
     for one in found.corners:
         if len(one.scene.prisms) or one.scene.gain or one.scene.fixed:
             raise ValueError(
-                "scenes must have no walls, no limits of range or view and no fixed anchors, as "
-                f"scenes of building files can have; got {one.scene.name!r}"
+                "scenes must have no walls, no limits of range or view and no fixed anchors, but "
+                f"{one.scene.name!r} (a building file) has; give a building as scene="
             )
     return found
 

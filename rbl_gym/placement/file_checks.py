@@ -90,17 +90,17 @@ def _check_zone(problem: Problem, zone: Zone, name: str) -> None:
     nearest = np.linalg.norm(problem.mounts.project(places) - places, axis=-1).min()
     for anchor in problem.fixed:
         nearest = min(nearest, np.linalg.norm(anchor - places, axis=-1).min())
-    if nearest >= problem.gain.max_range_m:
-        raise ValueError(
-            f"{name} is {nearest:.4g} m from the nearest mount, beyond anchors.max_range_m = "
-            f"{problem.gain.max_range_m:g}"
-        )
     extent = _extent(problem)
     if name != "region" and nearest > extent:
         raise ValueError(
             f"{name} is {nearest:.4g} m from the nearest mount, farther than the size of the "
             f"building ({extent:.4g} m): are its coordinates in metres, and in the axes of this "
             "building?"
+        )
+    if nearest >= problem.gain.max_range_m:
+        raise ValueError(
+            f"{name} is {nearest:.4g} m from the nearest mount, beyond anchors.max_range_m = "
+            f"{problem.gain.max_range_m:g}"
         )
 
 
@@ -121,8 +121,8 @@ def check_numbers(problem: Problem) -> None:
     n_fixed = len(problem.fixed)
     if problem.n_anchors < n_fixed:
         raise ValueError(
-            f"the number of anchors must be at least {n_fixed}, the number of anchors.fixed, which "
-            f"it includes; got {problem.n_anchors}"
+            f"the number of anchors must be at least {n_fixed}, as it includes those of "
+            f"anchors.fixed; got {problem.n_anchors}"
         )
     listed = problem.mounts.listed()
     if listed is not None and len(listed) < problem.n_anchors - n_fixed:

@@ -102,7 +102,10 @@ class PlacementTask:
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, Scene):
-            raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
+            raise ValueError(
+                "scene must be a Scene, as scenes.get('uwb_room') returns it, got "
+                f"{self.scene!r:.80}"
+            )
         for name, least, most in (
             ("n_anchors", 1, _MOST_PLACES),
             ("racks", 0, MAX_RACKS),
@@ -112,11 +115,11 @@ class PlacementTask:
             object.__setattr__(self, name, value)
         if not np.ptp(self.scene.volume.bounds(), axis=0).any():
             raise ValueError(
-                f"scene must have a volume with an extent, {self.scene.name!r} has none"
+                f"scene must have a volume larger than a point, that of {self.scene.name!r} is one"
             )
         if self.scene.links.offset is not None:
             raise ValueError(
-                f"scene must have ranges without an offset, got links.offset "
+                f"scene must have ranges without an offset (links.offset None), got "
                 f"{self.scene.links.offset!r}"
             )
         if self.racks and not isinstance(self.scene.anchor_region, Walls):

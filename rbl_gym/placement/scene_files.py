@@ -186,8 +186,8 @@ def check_n_anchors(number: Any) -> int:
         raise ValueError(f"the number of anchors must be a whole number, got {number!r:.80}")
     if not MIN_ANCHORS <= number <= MAX_ANCHORS:
         raise ValueError(
-            f"the number of anchors must be {MIN_ANCHORS} to {MAX_ANCHORS}, got {number}: fewer "
-            "than 3 never determine a pose"
+            f"the number of anchors must be {MIN_ANCHORS} to {MAX_ANCHORS}, got {number}"
+            f"{': fewer than 3 never determine a pose' * (number < MIN_ANCHORS)}"
         )
     return number
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.checks import did_you_mean
 from rbl_gym.recordings import bag_fields, bag_profiles, bag_reading
 from rbl_gym.recordings.bag_reading import Advance, AnyPath, Paths, log_name
 from rbl_gym.recordings.bag_tables import Sheet, Tables, make_tables, seconds
@@ -131,6 +132,7 @@ def show_message(log: Paths, topic: str, messages: AnyPath | None = None) -> lis
         if topic not in (topics := bag_reading.types(reader)):
             raise ValueError(
                 f"{log_name(log)}: no topic {topic!r}; the topics are {', '.join(topics)}"
+                f"{did_you_mean(topic, topics)}"
             )
         for received in bag_reading.messages(reader, [topic], lambda steps: None):
             return bag_fields.describe(received.message)

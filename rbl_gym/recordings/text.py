@@ -56,7 +56,10 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
     count = 0 if first < 0 else 1 if second < 0 else 2
     above = range(0 if first < 0 else first)
     if first < 0:
-        raise ValueError(f"{path}: must have the names of the columns and rows, got none")
+        raise ValueError(
+            f"{path}: the file is empty; it must have a header with the names of the columns, "
+            "and rows"
+        )
     comma = _delimiter(lines[first], lines[second] if count == 2 else lines[first])
     start, header = first, _split(lines[first], comma)
     if numbered and any(map(_is_numeric, header)):
@@ -80,7 +83,7 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
                 )
     rows, numbers, cut = _rows(path, lines, start, header, comma)
     if not rows:
-        raise ValueError(f"{path}: must have rows below the names of the columns, got none")
+        raise ValueError(f"{path}: must have rows below the header, got none")
     decimal = "."
     if comma != "," and _DECIMAL_COMMA.search(text := "\n".join(lines[first:])):
         decimal = ","

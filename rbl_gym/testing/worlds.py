@@ -187,7 +187,7 @@ def check_pose(name: str, pose: Any) -> None:
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max()
     require(
         defect < _SAME,
-        f"{name}.rotation must be orthogonal, but Q Q^T differs from I by {defect:.3g}",
+        f"{name}.rotation must be orthogonal, but Q @ Q.T differs from I by {defect:.3g}",
     )
     worst = np.linalg.det(Q).min()
     require(worst > 0, f"{name}.rotation must be proper, got a reflection (det {worst:.3g})")

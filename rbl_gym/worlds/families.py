@@ -158,7 +158,7 @@ def members_of(value: Any) -> tuple[Any, ...]:
         return (value,)
     if not isinstance(value, Sequence):
         raise ValueError(
-            f"scenes must be a list of scenes, a name or a dict of overrides, got {value!r:.80}"
+            f"scenes must be a list of scenes, a name or a dict of changes, got {value!r:.80}"
         )
     if not value:
         raise ValueError("scenes must hold at least one scene, got none")

@@ -118,7 +118,7 @@ def _law_of(value: Any) -> _Law | None:
 def _limits(path: str, value: Any) -> tuple[float, float]:
     low, high = check_array(path, value, (2,)).tolist()
     if low > high:
-        raise ValueError(f"{path} must be [low, high], got {value!r:.80}")
+        raise ValueError(f"{path} must be [low, high] with low at most high, got {value!r:.80}")
     return low, high
 
 

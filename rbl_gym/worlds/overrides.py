@@ -15,6 +15,8 @@ from rbl_gym.measurements.noise_laws import NOISE_FORMS, NOISE_LAWS
 _READ_BY_THEMSELVES = ("inertial",)
 # Fields that are a box or None. A dict gives the whole box.
 _OPTIONAL_BOXES = ("start_volume",)
+# Keys of values to draw from, in scenes of a family (`laws`).
+_LAWS = ("uniform", "log-uniform", "integers", "choice", "repeat")
 
 
 def replace(base: Any, changes: Mapping[str, Any], path: str, others: tuple[str, ...] = ()) -> Any:
@@ -77,8 +79,9 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
         kinds, value = {"box": Box}, {"kind": "box", **value}
     if not kinds and not dataclasses.is_dataclass(old):
         raise ValueError(
-            f"{path} must be one value, got the dict {dict(value)!r:.80}; only scenes=... takes "
-            "values to draw from (uniform, log-uniform, integers, choice, repeat)"
+            f"{path} must be one value, got the dict {dict(value)!r:.80}. Values to draw from need "
+            f"scenes=, and one of the keys {', '.join(_LAWS)}"
+            f"{''.join(did_you_mean(key, _LAWS) for key in [*value][:1])}"
         )
     if "kind" not in value:
         return replace(old, value, path)

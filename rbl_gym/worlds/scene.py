@@ -214,7 +214,9 @@ class Scene:
             object.__setattr__(self, "inertial", inertial.sensor(self.inertial))
             self.inertial.samples(self.dt)
             if self.prior == "start":
-                raise ValueError("prior must be 'drawn' in a scene with an inertial sensor")
+                raise ValueError(
+                    "prior must be 'drawn' in a scene with an inertial sensor, got 'start'"
+                )
         if self.anchors is not None and self.anchor_speed_m_s > 0:
             anchors, region = np.array(self.anchors), self.anchor_region
             # The kernel of a box would import numba with the named scenes.
@@ -243,7 +245,10 @@ class Scene:
             raise ValueError(f"{stated} must be None for trajectory {self.trajectory!r}")
         low, high = self.volume.bounds()
         if not (high > low)[:2].all():
-            raise ValueError(f"volume must have an extent in x and y for {self.trajectory!r}")
+            raise ValueError(
+                f"volume must have low below high in x and y for trajectory {self.trajectory!r}, "
+                f"got low {low}, high {high}"
+            )
 
     @functools.cached_property
     def obstruction(self) -> Obstacles:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from rbl_gym.checks import did_you_mean
 from rbl_gym.placement.file_keys import MATERIALS
 
 __all__ = ["KEYS", "KINDS", "Use", "parse_use"]
@@ -48,10 +49,12 @@ def parse_use(kind: str, text: str) -> Use:
     values: dict[str, Any] = {}
     for part in parts:
         key, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals or key not in KEYS[kind] or key in values:
+        if not equals or key in values:
+            raise ValueError(f"--{kind} {layer}: must be KEY=VALUE, each key once, got {part!r}")
+        if key not in KEYS[kind]:
             raise ValueError(
-                f"--{kind} {layer}: {part!r} must be KEY=VALUE, each key once; "
-                f"keys: {', '.join(KEYS[kind])}"
+                f"--{kind} {layer}: unknown key {key!r}; the keys are {', '.join(KEYS[kind])}"
+                f"{did_you_mean(key, KEYS[kind])}"
             )
         values[key] = value if key in TEXTS else number(f"--{kind} {layer}: {key}", value)
     if (

@@ -132,7 +132,10 @@ def read_records(path: Path) -> Records:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if number == len(lines):
                 break
-            raise ValueError(f"{path}, line {number}: not a record of rbl-gym bench") from error
+            raise ValueError(
+                f"{path}, line {number}: not a result of rbl-gym bench; the file must be one that "
+                "bench --out wrote"
+            ) from error
         records.append(record)
     return records
 

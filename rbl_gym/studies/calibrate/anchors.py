@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from rbl_gym.checks import FloatArray, check_count, check_number, check_one_of
+from rbl_gym.checks import FloatArray, check_count, check_number, check_one_of, did_you_mean
 from rbl_gym.estimators.calibration.drift import find_drift
 from rbl_gym.estimators.calibration.survey import Survey, SurveyModel, SurveyState, adjust
 from rbl_gym.estimators.calibration.survey_start import (
@@ -186,7 +186,8 @@ def survey_anchors(
     if unknown:
         raise ValueError(
             f"known must be anchors of the recording, got {unknown[0]!r}; the anchors are "
-            f"{recording.anchor_ids!r:.200}"
+            f"{', '.join(recording.anchor_ids):.200}"
+            f"{did_you_mean(unknown[0], recording.anchor_ids)}"
         )
     known = np.isin(recording.anchor_ids, settings.known)
     at = slice(None, None, -(-len(recording.times) // settings.epochs))
@@ -313,9 +314,9 @@ def _result(
     frame = (
         "that of the known anchors"
         if known.sum() >= (2 if settings.planar else 3)
-        else "from the known anchors; the turn that they leave open is that of the table"
+        else "that of the known anchors; the rotation that they leave open is that of the table"
         if known.any()
-        else "that of the table; the mean shift and turn of the anchors against it are zero"
+        else "that of the table; the mean shift and rotation of the anchors against it are zero"
         if settings.start == "table"
         else f"anchor {ids[0][0]} is the origin, anchor {ids[0][1]} lies on the x axis"
     )

@@ -52,10 +52,13 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
     for name, run in recordings.items():
         label = f"run {name!r}: " if name else ""
         if run.anchor_ids != first.anchor_ids or run.tag_ids != first.tag_ids:
-            raise ValueError(f"{label}runs must have the same anchors and tags")
+            raise ValueError(
+                f"{label}all runs must have the anchors and tags of the first, "
+                f"{next(iter(recordings))!r}"
+            )
         if run.truth is None:
             raise ValueError(
-                f"{label}links are calibrated by the truth, but the recording has none"
+                f"{label}the recording must have truth, with which links are calibrated, has none"
             )
         if run.truth.rotation is None and (len(run.tags) > 1 or run.tags.any()):
             raise ValueError(

@@ -278,6 +278,10 @@ def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
     return kind, int(np.prod(space.shape or ()))
 
 
+def _spaces(entries: int | None, kind: str, outputs: int) -> str:
+    return f"an observation of {entries} numbers and {outputs} outputs for {kind!r} actions"
+
+
 def check_fit(policy: Any, label: str, envs: Any) -> None:
     """Raise ValueError unless a policy fits the spaces of an environment, vector or scalar.
 
@@ -296,6 +300,4 @@ def check_fit(policy: Any, label: str, envs: Any) -> None:
     asked = (*(seen.shape or (None,)), *kind_and_outputs(acted))
     got = (policy.n_inputs, policy.kind, len(policy.biases[-1]))
     if got != asked:
-        raise ValueError(
-            f"{trained} with (observation, kind, outputs) = {got}, but the task has {asked}"
-        )
+        raise ValueError(f"{trained}, with {_spaces(*got)}, but this task has {_spaces(*asked)}")

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import estimators
-from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.estimators.networks import consensus
 from rbl_gym.estimators.networks.orientations import along_tree
 from rbl_gym.networks import graphs as network_graphs
@@ -183,12 +183,19 @@ def read_points(path: str) -> FloatArray:
         header = file.readline().strip().replace(" ", "")
         if header != "x,y":
             raise ValueError(f"{path}: must have the header x,y, got {header!r:.40}")
-        try:
-            points = np.loadtxt(file, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise ValueError(f"{path}: must have two numbers a line, {error}") from error
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
-        raise ValueError(f"{path}: must hold three points or more, got shape {points.shape}")
+        rows = []
+        for number, line in enumerate(file, start=2):
+            if line.strip():
+                try:
+                    x, y = map(float, line.split(","))
+                except ValueError:
+                    raise ValueError(
+                        f"{path}, line {number}: must be two numbers x,y, got {line.strip()!r:.40}"
+                    ) from None
+                rows.append((x, y))
+    points = check_array("positions", rows, ("n", 2)) if rows else np.zeros((0, 2))
+    if len(points) < 3:
+        raise ValueError(f"{path}: must have three points or more, got {len(points)}")
     return points
 
 

@@ -162,8 +162,8 @@ class Knowledge:
             check_number("height_m", self.height_m)
             if self.height_std_m is None and not self.planar:
                 raise ValueError(
-                    "height_m needs height_std_m, its standard deviation, or planar, with which "
-                    "the height is exact"
+                    "height_m needs height_std_m, its standard deviation; or set planar, with "
+                    "which the height is exact"
                 )
             if self.height_offset_m:
                 raise ValueError(
