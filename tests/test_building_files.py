@@ -399,7 +399,7 @@ BAD = [
     (
         "anchors.fixed",
         [[1, 1, 2]] * 9,
-        "the number of anchors must be at least 9, the number of anchors.fixed",
+        "the number of anchors must be at least 9, as it includes those of anchors.fixed",
     ),
     ("anchors.fixed", [[1, 2]], "anchors.fixed must have shape"),
     ("anchors.half_angle_deg", 200, "anchors.half_angle_deg must be a finite number in [0.1"),

@@ -307,7 +307,7 @@ def test_spread_of_residuals_leaves_biases_out():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"truth": None}, "calibrated by the truth"),
+        ({"truth": None}, "the recording must have truth"),
         ({"rotation": None}, "must have rotations"),
         ({"planar": True}, "set planar"),
         ({"late": 100.0}, "no range has truth"),

@@ -160,7 +160,7 @@ def test_all_cycles_of_k4_agree_with_the_projection_or_say_that_they_cannot():
             rests += 1
             with pytest.raises(ValueError, match="branch must be rint"):
                 cycle_projection(C, y, run.branch)
-            with pytest.raises(ValueError, match="which no angles have"):
+            with pytest.raises(ValueError, match="and no angles give"):
                 cycle_iteration(K4, y, 4, "all", branch=run.branch)
             with pytest.raises(RuntimeError, match=r"did not converge in \d+ steps: branch"):
                 cycle_consensus(K4, y, 4, "all", max_steps=1000)
@@ -265,7 +265,7 @@ def test_an_edge_that_comes_twice_was_measured_twice():
         ({"exchange": CycleExchange("random")}, "order must be one of"),
         (
             {"exchange": CycleExchange("asynchronous")},
-            r"rng must be a numpy\.random\.Generator, got None",
+            r"rng must be a numpy\.random\.Generator, .* got None",
         ),
         ({"max_steps": -1}, "max_steps must be an int of at least 0, got -1"),
         ({"max_steps": 2.5}, r"max_steps must be an int of at least 0, got 2\.5"),

@@ -308,7 +308,7 @@ def test_derivatives_of_the_costs_by_finite_differences():
         ({"station": [1.0, 2.0]}, "station must have shape"),
         ({"distance_weight": 0.0}, "distance_weight must be"),
         ({"half_space": ["y>0"]}, "half_space must be"),
-        ({"method": "pso", "rng": 7}, r"rng must be a numpy\.random\.Generator, got 7"),
+        ({"method": "pso", "rng": 7}, r"rng must be a numpy\.random\.Generator, .* got 7"),
     ],
 )
 def test_bad_input_is_named(changes, message):

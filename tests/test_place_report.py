@@ -136,7 +136,7 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
         (["plan", "nowhere.geojson"], "nowhere.geojson: No such file or directory"),
         (["plan", "x.dwg"], "x.dwg: DWG files cannot be read: save the drawing as DXF"),
         (["plan", "x.png", "--walls", "A"], "a picture has no layers: leave out --walls"),
-        (["plan", "x.geojson", "--walls", "A,x=1"], "'x=1' must be KEY=VALUE"),
+        (["plan", "x.geojson", "--walls", "A,x=1"], "unknown key 'x'; the keys are material"),
         (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),
         (["place", "--scene", "uwb_room", "--walls", "A"], "--walls needs a drawing"),
         (["place", "--scene", "uwb_room", "--report", "x.doc"], "--report must end in .pdf"),

@@ -422,7 +422,7 @@ def test_what_a_task_keeps_cannot_be_written_to():
         (("attic",), "scene must be one of"),
         (
             ("camsap2013",),
-            "scene must have a volume larger than a point, that of 'camsap2013' is one",
+            "scene must have a volume, that of 'camsap2013' is a point",
         ),
         (("uwb_room", 0), "n_anchors must be an int from 1 to 1000000, got 0"),
         (("uwb_room", 2.0), "n_anchors must be an int from 1 to 1000000, got 2.0"),
@@ -441,7 +441,7 @@ def test_bad_tasks_are_refused(arguments, message):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"scene": "uwb_room"}, "scene must be a Scene, as scenes.get"),
+        ({"scene": "uwb_room"}, "scene must be a Scene such as scenes.get"),
         ({"n_poses": 0}, "n_poses must be"),
     ],
 )

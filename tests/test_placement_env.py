@@ -233,7 +233,7 @@ def test_contexts_are_those_in_info():
     ("arguments", "message"),
     [
         ({"scene": "attic"}, "scene must be one of"),
-        ({"scene": "camsap2013"}, "scene must have a volume larger than a point"),
+        ({"scene": "camsap2013"}, "scene must have a volume, that of"),
         ({"scene": 7}, "scene must be a name or a dict"),
         ({"mode": "all"}, "mode must be one of 'sequential', 'one-shot', 'mounts', got 'all'"),
         ({"mode": "mounts"}, "scene must have walls for mount points, got 'auv_buoys'"),

@@ -158,7 +158,7 @@ def test_numbers_are_drawn_within_their_bounds():
         ({"scenes": MIXED, "sight": True}, "scenes must be rooms with walls"),
         ({"scenes": MIXED, "mode": "all"}, "mode must be one of"),
         ({"scenes": MIXED, "mirror": 1}, "mirror must be True or False"),
-        ({"scenes": ["camsap2013"]}, "volume larger than a point"),
+        ({"scenes": ["camsap2013"]}, "scene must have a volume"),
         ({"scenes": [{"name": "uwb_room", "racks": {"integers": [0, 3]}}]}, "racks"),
     ],
 )

@@ -167,7 +167,7 @@ def test_a_start_is_the_prior():
     [
         ({"start": (1, 2)}, "start must be x, y, z and optionally yaw_deg, got 2 numbers"),
         ({"prior_position_m": 1.0}, "prior_position_m needs start"),
-        ({"height_m": 1.0}, "height_m needs height_std_m, its standard deviation, or planar"),
+        ({"height_m": 1.0}, "height_m needs height_std_m, its standard deviation; or set planar"),
         ({"height_std_m": 1.0}, "height_std_m needs height_m"),
         ({"planar": True, "tilt_std_deg": 1.0}, "must be left out with planar, where height"),
         (

@@ -296,7 +296,7 @@ def test_anchors_without_a_legal_place():
     ("arguments", "message"),
     [
         ({"scene": "moon"}, "scene must be one of"),
-        ({"scene": "camsap2013"}, "scene must have a volume larger than a point"),
+        ({"scene": "camsap2013"}, "scene must have a volume, that of"),
         ({"scene": "uwb_room", "n_anchors": 2}, "the number of anchors must be 3 to 256"),
         ({"scene": "uwb_room", "racks": 3}, "racks must be"),
         ({"scene": "satellite", "racks": 1}, "racks must be 0 in a scene without walls"),

@@ -215,7 +215,11 @@ class Standstill(Wrapped):
         (OneBody, "shapes", r"initial must accept .* raised IndexError\('too many bodies'\)"),
         (FlatCovariance, "shapes", r"belief.covariance must be .* \(6, 6\), got float64 \(36,\)"),
         (Single, "shapes", r"belief.translation must be a float64 array .* got float32"),
-        (Skewed, "pose", "belief.rotation must be orthogonal, but Q Q.T differs from I by 0.0201"),
+        (
+            Skewed,
+            "pose",
+            "belief.rotation must be orthogonal, but Q @ Q.T differs from I by 0.0201",
+        ),
         (Reflected, "pose", r"proper, got a reflection \(det -1\)"),
         (Lopsided, "pose", "belief.covariance must be symmetric"),
         (Negative, "pose", "belief.covariance must be positive definite, least eigenvalue -"),

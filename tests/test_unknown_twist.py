@@ -199,7 +199,7 @@ def test_drawn_trajectories_have_the_laws_moments():
         ),
         (
             lambda: ut.simulate_wandering(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 1, 0),  # pyright: ignore[reportArgumentType]
-            "rng must be a numpy.random.Generator, got 0",
+            "rng must be a numpy.random.Generator, .* got 0",
         ),
         (
             lambda: bounds.posterior_step(

@@ -103,8 +103,7 @@ class PlacementTask:
     def __post_init__(self) -> None:
         if not isinstance(self.scene, Scene):
             raise ValueError(
-                "scene must be a Scene, as scenes.get('uwb_room') returns it, got "
-                f"{self.scene!r:.80}"
+                f"scene must be a Scene such as scenes.get('hall'), got {self.scene!r:.80}"
             )
         for name, least, most in (
             ("n_anchors", 1, _MOST_PLACES),
@@ -114,9 +113,7 @@ class PlacementTask:
             value = check_count(name, getattr(self, name), least=least, most=most)
             object.__setattr__(self, name, value)
         if not np.ptp(self.scene.volume.bounds(), axis=0).any():
-            raise ValueError(
-                f"scene must have a volume larger than a point, that of {self.scene.name!r} is one"
-            )
+            raise ValueError(f"scene must have a volume, that of {self.scene.name!r} is a point")
         if self.scene.links.offset is not None:
             raise ValueError(
                 f"scene must have ranges without an offset (links.offset None), got "

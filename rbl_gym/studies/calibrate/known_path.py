@@ -57,9 +57,7 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
                 f"{next(iter(recordings))!r}"
             )
         if run.truth is None:
-            raise ValueError(
-                f"{label}the recording must have truth, with which links are calibrated, has none"
-            )
+            raise ValueError(f"{label}the recording must have truth to calibrate links, has none")
         if run.truth.rotation is None and (len(run.tags) > 1 or run.tags.any()):
             raise ValueError(
                 f"{label}the truth must have rotations if tags are off the body's origin, got "
