@@ -204,8 +204,8 @@ def test_estimate_pose_runs_filterpy_and_equals_the_batched_engine(scene, name, 
     [
         (np.nan, r"ranges must be finite, got nan at index \(9, 3, 2\)"),
         (np.inf, r"ranges must be finite, got inf at index \(9, 3, 2\)"),
-        (-1.0, r"ranges must be positive where measured, got -1.0 at \(9, 3, 2\)"),
-        (0.0, r"ranges must be positive where measured, got 0.0 at \(9, 3, 2\)"),
+        (-1.0, r"ranges must be positive where measured, got -1.0 at index \(9, 3, 2\)"),
+        (0.0, r"ranges must be positive where measured, got 0.0 at index \(9, 3, 2\)"),
     ],
 )
 def test_no_engine_lets_a_bad_range_through(weights, value, message):

@@ -268,7 +268,7 @@ def test_filters_are_named_by_dicts_too():
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"filter": {"iterations": 2}}, "filter must be a name, or a dict with a name"),
+        ({"filter": {"iterations": 2}}, "filter must be a name, or a dict with the key 'name'"),
         ({"filter": {"name": "iekf"}, "options": {}}, "options must be None if filter is a dict"),
         ({"filter": {"name": "gold"}}, "filter must be one of"),
         ({"filter": {"name": "iekf", "wings": 2}}, "wings"),
