@@ -96,7 +96,9 @@ def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArra
         raise ValueError(f"covariance must be symmetric, but its asymmetry is {skew:.3g}")
     smallest = np.linalg.eigvalsh(covariance).min()
     if smallest <= 0:
-        raise ValueError(f"covariance must be positive definite, smallest eigenvalue {smallest:g}")
+        raise ValueError(
+            f"covariance must be positive definite, but its smallest eigenvalue is {smallest:g}"
+        )
     return covariance
 
 

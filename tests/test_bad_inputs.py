@@ -46,7 +46,10 @@ def spoiled(array, index, value):
         ({"translation": [0, np.nan, 0]}, r"translation must be finite, got nan at index \(1,\)"),
         ({"translation": "here"}, "translation must be an array of real numbers, got 'here'"),
         ({"covariance": np.eye(5)}, r"covariance must have shape .*, got \(5, 5\)"),
-        ({"covariance": np.zeros((6, 6))}, "covariance must be positive definite, .* eigenvalue 0"),
+        (
+            {"covariance": np.zeros((6, 6))},
+            "covariance must be positive definite, .* eigenvalue is 0",
+        ),
         (
             {"covariance": spoiled(np.eye(6), (0, 1), 0.5)},
             "covariance must be symmetric, but its asymmetry is",

@@ -94,7 +94,10 @@ def test_one_scene_is_a_family_too():
         ({"name": {"choice": []}}, "name.choice must be a list of values"),
         ({"name": {"choice": "hall"}}, "name.choice must be a list of values"),
         ({"name": "hall", "n_anchors": {"integers": [0, 4]}}, "n_anchors"),
-        ({"name": "hall", "tags": {"repeat": 3}}, "repeat must be a dict with count and of, got 3"),
+        (
+            {"name": "hall", "tags": {"repeat": 3}},
+            "repeat must be a dict with the keys count and of, got 3",
+        ),
         (
             {"name": "hall", "tags": {"repeat": {"count": [1, 2, 3], "of": [0, 0, 0]}}},
             r"repeat.count must be a number or \[low, high\]",
@@ -160,7 +163,7 @@ def test_a_stretched_scene_has_its_places_multiplied():
     [
         ({"name": "hall", "stretch": [1.0, 0.0, 1.0]}, "stretch must be three positive numbers"),
         ({"name": "hall", "stretch": 2.0}, "scene.stretch must have shape"),
-        ({"name": "satellite", "stretch": [1, 1, 2]}, "stretch needs a box or walls"),
+        ({"name": "satellite", "stretch": [1, 1, 2]}, "stretch scales boxes and walls only"),
     ],
 )
 def test_what_cannot_be_stretched_is_named(scene, named):

@@ -135,7 +135,7 @@ def test_bad_arguments_are_named():
         (lambda: score_and_gradient(anchors, poses, tags, law, np.ones((7, 3))), "share must have"),
         (
             lambda: score_and_gradient(anchors, poses, tags, ranging.LinkNoise(np.ones((4, 5)))),
-            "noise must be a law of",
+            "noise must be a law whose",
         ),
         (lambda: Gain(-1.0), "max_range_m"),
         (lambda: Gain(5.0, 6.0), "range_edge_m"),

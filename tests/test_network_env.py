@@ -280,7 +280,7 @@ def test_options_of_the_consensus_lead_to_one_estimate(kappa, cycles):
     ("options", "message"),
     [
         ({"cycles": "none"}, "cycles must be one of"),
-        ({"cycles": 3}, "cycles must be a name, as 'bfs', got 3"),
+        ({"cycles": 3}, "cycles must be a name such as 'bfs', got 3"),
         ({"kappa": "fast"}, "kappa must be one of"),
         ({"kappa": 0.7}, "kappa must lie in"),
         ({"order": "random"}, "order must be one of"),

@@ -33,6 +33,10 @@ def said(capsys, *arguments):
         (["replay", *FILES, "--height-m", "1"], "--height-m needs --height-std-m, its"),
         (["replay", *FILES, "--plot", "x.foo"], "--plot: must end in one of .png, .*'x.foo'"),
         (["place", "--scene", "uwb_rom"], "--scene must be one of .* did you mean 'uwb_room'"),
+        (
+            ["replay", *FILES, "--columns", "foo=bar"],
+            "missing column 'bar' .*'foo' is not a known qu",
+        ),
         (["replay", *FILES, "--height-m", "1"], ".*; or set --planar, with which the height is"),
         (["bench", "--filters", "iekf,ikef"], "--filters: filter must be one of .* mean 'iekf'"),
         (["bench", "--conditions", "nlso"], "--conditions: condition must be .* mean 'nlos'"),

@@ -79,12 +79,12 @@ def test_a_policy_whose_archive_points_before_its_begin(tmp_path):
         (lambda: batch.reset_mask("x", 2), "options must be a dict or None, got 'x'"),  # pyright: ignore
         (lambda: batch.reset_mask({"reset_mask": [[1], [1, 2]]}, 2), "reset_mask must be an array"),
         (lambda: batch.seeds_of("ab", 2), "seed must be an int, a list of ints or None, got 'ab'"),  # pyright: ignore
-        (lambda: batch.seeds_of([1], 2), r"seed must hold 2 seeds, got \[1\]"),
+        (lambda: batch.seeds_of([1], 2), r"seed must have 2 seeds, .* got \[1\]"),
         (lambda: batch.seeds_of([1, 1.5], 2), "seed must be a non-negative int or None"),  # pyright: ignore
         (lambda: batch.seeds_of(-1, 2), "seed must be a non-negative int .* got -1"),
         (
             lambda: wrappers.EstimatePose(TrackingEnv(), options={1: 2}),  # pyright: ignore
-            "options must be a dict by names, or None, got {1: 2}",
+            "options must be a dict of names and values, or None, got {1: 2}",
         ),
     ],
 )

@@ -126,7 +126,7 @@ def test_wrong_rewards_are_named(reward, named):
     ("reward", "named"),
     [
         (lambda _: math.nan, "reward must be finite, got"),
-        (lambda _: np.zeros(2), r"reward must return shape \(\), got \(2,\)"),
+        (lambda _: np.zeros(2), r"one number for each world, shape \(\), got shape \(2,\)"),
     ],
 )
 def test_what_a_function_returns_is_checked(reward, named):

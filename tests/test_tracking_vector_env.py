@@ -69,7 +69,7 @@ def test_bad_calls_are_named():
         env.step(np.zeros((2, 12)))
     with pytest.raises(gym.error.ResetNeeded, match="all environments before"):
         env.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(ValueError, match="seed must hold 2 seeds, got"):
+    with pytest.raises(ValueError, match="seed must have 2 seeds, one for each world, got"):
         env.reset(seed=[1, 2, 3])
     env.reset(seed=1)
     for bad in (np.zeros((2, 11)), np.zeros((1, 2, 12)), np.full((2, 12), np.nan)):

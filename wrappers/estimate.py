@@ -292,7 +292,9 @@ def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping) or not all(isinstance(key, str) for key in options):
-        raise ValueError(f"options must be a dict by names, or None, got {options!r:.80}")
+        raise ValueError(
+            f"options must be a dict of names and values, or None, got {options!r:.80}"
+        )
     for key in ("name", "tags", "noise", "process"):
         if key in options:
             raise ValueError(

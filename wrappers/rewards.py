@@ -135,6 +135,7 @@ def _with_options(options: dict[str, Any]) -> Reward:
     if not isinstance(kind, str) or kind not in REWARDS:
         raise ValueError(
             f"reward must have a kind, one of {', '.join(map(repr, REWARDS))}, got {kind!r:.80}"
+            f"{did_you_mean(kind, REWARDS)}"
         )
     function = REWARDS[kind]
     known = [*inspect.signature(function).parameters][1:]
@@ -169,7 +170,9 @@ def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
     value = np.asarray(value, dtype=np.float64)
     shape = np.shape(outcome.figures.score_m)
     if value.shape != shape:
-        raise ValueError(f"reward must return shape {shape}, got {value.shape}")
+        raise ValueError(
+            f"reward must return one number for each world, shape {shape}, got shape {value.shape}"
+        )
     if not all_finite(value):
         raise ValueError(f"reward must be finite, got {value!s:.80}")
     return value

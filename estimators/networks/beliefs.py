@@ -42,7 +42,7 @@ def check_consensus(cycles: Any, kappa: Any, order: Any, steps: Any) -> Consensu
     """Check the options by a run on a triangle; raise ValueError that names a wrong one."""
     steps = check_count("steps", steps, least=0)
     if not isinstance(cycles, str):
-        raise ValueError(f"cycles must be a name, as 'bfs', got {cycles!r:.80}")
+        raise ValueError(f"cycles must be a name such as 'bfs', got {cycles!r:.80}")
     exchange = CycleExchange(order, np.random.default_rng(0))
     cycle_iteration([[0, 1], [1, 2], [0, 2]], np.zeros(3), 3, cycles, kappa, exchange=exchange)
     return Consensus(cycles, kappa, order, steps)

@@ -317,7 +317,7 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
         raise ValueError(f"seed must be an int, a list of ints or None, got {seed!r:.80}")
     if np.shape(seed)[:1] != (num_envs,) if isinstance(seed, np.ndarray) else len(seed) != num_envs:
-        raise ValueError(f"seed must hold {num_envs} seeds, got {seed!r:.80}")
+        raise ValueError(f"seed must have {num_envs} seeds, one for each world, got {seed!r:.80}")
     return [_seed(one) for one in seed]
 
 

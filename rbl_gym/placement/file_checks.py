@@ -73,7 +73,7 @@ def _check_fixed(problem: Problem) -> None:
         index = int(held.argmax())
         raise ValueError(
             f"anchors.fixed[{index}] = {show(problem.fixed[index])} lies inside an obstacle, "
-            "which blocks its links: put it in front of the face"
+            "which blocks its links: move it in front of the obstacle's face"
         )
 
 

@@ -57,7 +57,10 @@ def score_and_gradient(
     anchors, tags = check_array("anchors", anchors, ("M", 3)), check_array("tags", tags, ("N", 3))
     law = ranging.numbers_of(noise, len(tags))
     if law is None:
-        raise ValueError(f"noise must be a law of ranging.NOISE_LAWS, got {noise!r:.80}")
+        raise ValueError(
+            "noise must be a law whose derivative is known, such as ranging.RangeNoise(0.1), got "
+            f"{noise!r:.80}"
+        )
     if normals is None:
         normals = np.zeros((1, 3))
     normals = np.broadcast_to(check_array("normals", normals, ("M", 3)), anchors.shape)

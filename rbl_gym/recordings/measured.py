@@ -146,7 +146,7 @@ def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
         if column == "tag" and len(ids) > 1:
             raise ValueError(
                 f"{table.path}: give the positions of the tags on the body (--tags), as the ranges "
-                f"are of {len(ids)} tags, {ids!r:.200}"
+                f"are of {len(ids)} tags, {', '.join(ids):.200}"
             )
         return ids
     return points.ids
@@ -239,7 +239,7 @@ def _links_of(
     if "{tag}" not in pattern and len(tags) > 1:
         raise ValueError(
             f"columns of links must have {{tag}} in their names, as there are {len(tags)} tags, "
-            f"{tags!r:.200}; got {pattern!r}"
+            f"{', '.join(tags):.200}; got {pattern!r}"
         )
     return links, (anchors, tags)
 
@@ -256,7 +256,7 @@ def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[s
     if len(found) > 1:
         raise ValueError(
             f"{table.path}: give the positions of the tags on the body (--tags), as the ranges are "
-            f"of {len(found)} tags, {[*found]!r:.200}"
+            f"of {len(found)} tags, {', '.join(found):.200}"
         )
     return tuple(found) or ("0",)
 

@@ -321,7 +321,8 @@ def _roles(
                     f"{where}: {role!r} is not the name of a quantity; did you mean {swapped}?"
                 )
             absent.append(f"{name!r} for {role}")
-            near = near or (role not in _QUANTITIES and did_you_mean(role, _QUANTITIES)) or ""
+            if role not in _QUANTITIES and not near:
+                near = did_you_mean(role, _QUANTITIES) or f"; {role!r} is not a known quantity"
         names[role] = name
     if absent:
         word = "column" if len(absent) == 1 else "columns"

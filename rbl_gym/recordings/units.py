@@ -54,7 +54,7 @@ def check_units(
         hint = (
             "are the ranges in cm or mm? set --unit"
             if scale > 1
-            else f"are the positions in {paths[1]} in cm or mm?"
+            else f"are the positions in {paths[1]} in cm or mm, or is the unit of the ranges wrong?"
         )
         raise ValueError(
             f"{paths[0]}: units look inconsistent, the median range is {typical:.4g} m and "

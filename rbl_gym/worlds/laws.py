@@ -155,7 +155,7 @@ def _check_choice(path: str, value: Any) -> None:
 
 def _check_repeat(path: str, value: Any) -> None:
     if not isinstance(value, Mapping) or set(value) != {"count", "of"}:
-        raise ValueError(f"{path} must be a dict with count and of, got {value!r:.80}")
+        raise ValueError(f"{path} must be a dict with the keys count and of, got {value!r:.80}")
     numbers = _counts(value)
     if len(numbers) != 2:
         raise ValueError(

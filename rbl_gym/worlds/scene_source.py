@@ -64,7 +64,7 @@ def read_scene(name: str) -> Any:
     if isinstance(found, Mapping) and "name" in found:
         return dict(found)
     raise ValueError(
-        f"{name} must hold a table with the key 'name' (overrides of a scene) or 'body' (a "
+        f"{name} must hold a table with the key 'name' (changes of a scene) or 'body' (a "
         f"building file), got {found!r:.80}"
     )
 

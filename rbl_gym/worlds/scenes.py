@@ -271,7 +271,8 @@ def _stretched(scene: Scene, stretch: Any) -> Scene:
             values[name] = dataclasses.replace(region, low=low, high=high)
         elif region is not None:
             raise ValueError(
-                f"scene.stretch needs a box or walls, {name} of {scene.name!r} is {region!r:.80}"
+                f"scene.stretch scales boxes and walls only, but {name} of {scene.name!r} is "
+                f"{region!r:.80}"
             )
     for name in ("anchors", "obstacles", "start_translation"):
         places = getattr(scene, name)

@@ -331,8 +331,8 @@ def measure_epoch(
         return measured
     if at.offsets is None:
         raise ValueError(
-            f"links.offset must be None for an epoch without offsets, got {scene.links.offset!r}: "
-            "draw the episode from this scene"
+            f"links.offset must be None, got {scene.links.offset!r}: the episode was drawn from a "
+            "scene without offsets; draw it from this scene"
         )
     return ranging.with_offsets(measured, scene.links, at.offsets)
 

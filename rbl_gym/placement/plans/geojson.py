@@ -134,7 +134,8 @@ def _projected(drawing: Drawing, zero: tuple[float, float] | None) -> Drawing:
     low, high = drawing.bounds()
     if np.abs([low[0], high[0]]).max() > 180 or np.abs([low[1], high[1]]).max() > 90:
         raise ValueError(
-            f"{drawing.path}: coordinates to ({high[0]:.7g}, {high[1]:.7g}) are not degrees"
+            f"{drawing.path}: coordinates up to ({high[0]:.7g}, {high[1]:.7g}) are not longitudes "
+            "and latitudes in degrees: give another unit (--units)"
         )
     zero = tuple(low.tolist()) if zero is None else zero
     metres = [

@@ -91,7 +91,7 @@ def sensor_clock(
         if step == _STEPS[0] and best in (tried[0], tried[-1]):
             raise ValueError(
                 f"{name}: the likelihood of the ranges is highest at {best:+.2f} s, the end of "
-                "the search; give a rough offset"
+                f"the search; give a rough offset (--time-offset {name.partition('_')[0]}=S)"
             )
         advance()
     fine = _STEPS[-1]

@@ -104,7 +104,8 @@ def tune(
     count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
     if count < 10:
         raise ValueError(
-            f"the first {seconds:g} s must have at least 10 epochs for tuning, got {count}"
+            f"the first {seconds:g} s must have at least 10 epochs for tuning, got {count}: use a "
+            "longer part (--tune-s)"
         )
     given = local_trial(recording.part(slice(count)), settings)
     ranges = given.recording.links.sum()
