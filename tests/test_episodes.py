@@ -42,10 +42,10 @@ def test_every_world_is_at_its_epoch_of_its_own_episode(name, links):
 
 def test_more_worlds_than_are_built_together_are_all_begun():
     scene = scenes.get({"name": "uwb_room", "steps": 2})
-    store = EpisodeStore(scene, 300)
+    store = EpisodeStore(scene, 1100)
     assert store.empty
-    anchors = store.begin(np.arange(300), generators(range(300)))["anchors"]
-    assert anchors.shape == (300, 6, 3)
-    last = simulation.draw_episode(scene, np.random.default_rng(299))
-    at = store.at(np.full(300, 2))
-    np.testing.assert_allclose(at.translation[299], last.translation[2], rtol=1e-12)
+    anchors = store.begin(np.arange(1100), generators(range(1100)))["anchors"]
+    assert anchors.shape == (1100, 6, 3)
+    last = simulation.draw_episode(scene, np.random.default_rng(1099))
+    at = store.at(np.full(1100, 2))
+    np.testing.assert_allclose(at.translation[1099], last.translation[2], rtol=1e-12)

@@ -121,11 +121,12 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
     ) -> dict[str, np.ndarray] | None:
         """Start new episodes in the worlds with these indices.
 
-        May return infos of these worlds that exist only at the start of an episode."""
+        May return infos of these worlds that exist only at the start of an episode; the caller may
+        keep and change them."""
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Step the worlds of the mask; return rewards and terminations of all worlds.
+        """Step the worlds of the mask; return new arrays of rewards and terminations of all worlds.
 
         At least one world is stepped."""
         raise NotImplementedError
@@ -176,22 +177,24 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         if not self._generators:
             raise gym.error.ResetNeeded("call reset() before step()")
         checked = check_actions("actions", actions, self.single_action_space, self.num_envs)
-        ended = self._done.copy()
-        some_ended = ended.any()
-        if some_ended and self.autoreset_mode is AutoresetMode.DISABLED:
+        moving = ~self._done
+        all_move = moving.all()
+        if not all_move and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
                 "some episodes are over: call reset(), with options={'reset_mask': mask} to "
                 "reset only these"
             )
-        moving = ~ended
         self._epochs += moving
-        reward, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
-        if moving.any():
-            advanced, over = self._advance(checked, moving)
-            reward, terminated = np.where(moving, advanced, 0.0), over & moving
+        if all_move:
+            reward, terminated = self._advance(checked, moving)
+        else:
+            reward, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
+            if moving.any():
+                advanced, over = self._advance(checked, moving)
+                reward, terminated = np.where(moving, advanced, 0.0), over & moving
         truncated = moving & ~terminated & (self._epochs >= self.steps_limit)
         self._done = terminated | truncated
-        start = self._begin(ended) if some_ended else {}
+        start = {} if all_move else self._begin(~moving)
         self._shoot()
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._done.any():
             info = {**self._masked_info(), **start}
@@ -224,9 +227,11 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         info: dict[str, np.ndarray] = {}
         told = self._restart(chosen, [self._generators[i] for i in chosen])
         for name, value in (told or {}).items():
-            nothing = None if value.dtype == np.object_ else 0
-            info[name] = np.full((self.num_envs, *value.shape[1:]), nothing, value.dtype)
-            info[name][chosen] = value
+            info[name] = value
+            if len(chosen) < self.num_envs:
+                nothing = None if value.dtype == np.object_ else 0
+                info[name] = np.full((self.num_envs, *value.shape[1:]), nothing, value.dtype)
+                info[name][chosen] = value
             info[f"_{name}"] = mask.copy()
         return info
 

@@ -16,6 +16,8 @@ from rbl_gym.worlds.stacked import StackedScenes
 
 # Number of worlds drawn and built together, so that their random numbers do not fill the memory.
 _BLOCK = 1024
+# Number of worlds written together: their random numbers stay in the cache.
+_FEW = 32
 
 
 class EpisodeStore:
@@ -50,7 +52,7 @@ class EpisodeStore:
             simulation.draw_each(draws, generators[first : first + len(block)])
             rows = rows_of(block)
             episode = simulation.build_episode(self._scene, draws, self._motion_of(rows))
-            self._write(rows, simulation.whole(episode))
+            self._write(block, simulation.whole(episode))
             starts.append(episode[len(simulation.Epoch._fields) :])
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
@@ -65,18 +67,25 @@ class EpisodeStore:
             return None
         return simulation.Motion(*[np.swapaxes(field[:, rows], 0, 1) for field in self._timed[:3]])  # pyright: ignore
 
-    def _write(self, rows: slice | np.ndarray, fields: simulation.Epoch) -> None:
+    def _write(self, worlds: np.ndarray, fields: simulation.Epoch) -> None:
         """Store the epochs of some worlds; NumPy skips the assignment of a view to itself."""
         if not self._timed:
+            # Without the spare worlds, epochs of 1024 worlds would share lines of the cache.
+            room = self._num_envs + self._num_envs // 256
             self._timed = [
                 None
                 if field is None
-                else np.empty((field.shape[1], self._num_envs, *field.shape[2:]))
+                else np.empty((field.shape[1], room, *field.shape[2:]))[:, : self._num_envs]
                 for field in fields
             ]
-        for stored, field in zip(self._timed, fields, strict=True):
-            if stored is not None and field is not None:
-                stored[:, rows] = np.swapaxes(field, 0, 1)
+        for k, (stored, field) in enumerate(zip(self._timed, fields, strict=True)):
+            if stored is None or field is None:
+                continue
+            # The motion is in place already if the worlds are contiguous.
+            few = len(worlds) if k < len(simulation.Motion._fields) else _FEW
+            for first in range(0, len(worlds), few):
+                part = slice(first, first + few)
+                stored[:, rows_of(worlds[part])] = np.swapaxes(field[part], 0, 1)
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """Return the epochs (B,) of all worlds; the random numbers must not be written to."""
