@@ -138,10 +138,11 @@ def make(
     ------
     ValueError
         If the name or an option is unknown or given twice, a factory does not have the three
-        arguments, or an argument is out of range.
+        arguments, what it makes lacks a method of `Filter`, or an argument is out of range.
     """
     name, options = parse_filter(name, options)
     factory = factory_of(name)
+    shown = repr(name) if isinstance(name, str) else getattr(name, "__name__", f"{name!r:.80}")
     tags = check_array("tags", tags, ("N", 3))
     of_ranges = options.get("measurement", "ranges") == "ranges"
     for label, value, methods in (
@@ -160,17 +161,24 @@ def make(
     missing = [key for key in laws if not (takes_any or key in parameters)]
     if missing:
         raise ValueError(
-            f"filter {name!r:.80} must be made by factory(tags=..., noise=..., process=...), but "
+            f"filter {shown} must be made by factory(tags=..., noise=..., process=...), but "
             f"its arguments are ({', '.join(parameters)})"
         )
     known = [key for key in parameters if key not in laws]
     unknown = [key for key in options if key in laws or not (takes_any or key in known)]
     if unknown:
         raise ValueError(
-            f"filter {name!r} has no option {unknown[0]!r}; its options are {', '.join(known)}"
+            f"filter {shown} has no option {unknown[0]!r}; its options are {', '.join(known)}"
             f"{did_you_mean(unknown[0], known)}"
         )
-    return factory(tags=tags, noise=noise, process=process, **options)
+    made = factory(tags=tags, noise=noise, process=process, **options)
+    for method in ("initial", "predict", "update", "belief"):
+        if not callable(getattr(made, method, None)):
+            raise ValueError(
+                f"filter {shown} must have the methods initial, predict, update and belief, "
+                f"got {type(made).__name__} without {method}"
+            )
+    return made
 
 
 def parse_filter(text: Any, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -88,6 +88,16 @@ def test_wrong_factories_are_named():
         scalar(3)
 
 
+def test_a_filter_without_a_method_is_named_before_it_runs():
+    class Still:
+        def __init__(self, tags, noise, process):
+            made = once(tags, noise, process)
+            self.initial, self.update, self.belief = made.initial, made.update, made.belief
+
+    with pytest.raises(ValueError, match=r"filter Still must have .*, got Still without predict"):
+        scalar(Still)
+
+
 def test_the_studio_names_a_filter_by_its_class():
     env: Any = EstimatePose(gym.make(ID, scene=short("hall", 4)), once, {})
     found = own_filter(env)

@@ -430,7 +430,7 @@ def test_what_a_task_keeps_cannot_be_written_to():
         (("uwb_room", 4, 3), "racks must be an int from 0 to 2, got 3"),
         (("uwb_room", 4, -1), "racks must be an int from 0 to 2, got -1"),
         (("uwb_room", None, "two"), "racks must be an int from 0 to 2, got 'two'"),
-        (("auv_buoys", 4, 1), "racks must be 0 in a scene without walls, got 1 in 'auv_buoys'"),
+        (("auv_buoys", 4, 1), "racks must be 0 outside a named room, got 1 in 'auv_buoys'"),
     ],
 )
 def test_bad_tasks_are_refused(arguments, message):

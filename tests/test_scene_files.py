@@ -299,7 +299,7 @@ def test_anchors_without_a_legal_place():
         ({"scene": "camsap2013"}, "scene must have a volume, that of"),
         ({"scene": "uwb_room", "n_anchors": 2}, "the number of anchors must be 3 to 256"),
         ({"scene": "uwb_room", "racks": 3}, "racks must be"),
-        ({"scene": "satellite", "racks": 1}, "racks must be 0 in a scene without walls"),
+        ({"scene": "satellite", "racks": 1}, "racks must be 0 outside a named room"),
         ({"scene": "x.toml", "racks": 1}, "racks must be 0 with a file"),
         ({"scene": "uwb_room", "region": ([0, 0, 0], [11, 1, 1])}, "region must lie inside"),
         ({"scene": "uwb_room", "region": ([2, 2, 2], [1, 1, 1])}, "region: low must lie below"),

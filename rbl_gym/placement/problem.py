@@ -121,7 +121,7 @@ class PlacementTask:
             )
         if self.racks and not isinstance(self.scene.anchor_region, Walls):
             raise ValueError(
-                f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"
+                f"racks must be 0 outside a named room, got {self.racks} in {self.scene.name!r}"
             )
 
     @property
