@@ -1,10 +1,11 @@
-"""This checkout beside another commit's: the iterated EKF and `locate`, time and ratio, one run.
+"""This checkout beside another commit's: filters, `locate` and environments, time and ratio.
 
 Both are measured by this script, each in processes of its own that take turns; what it calls is
-the same in both. Process time, one thread; medians over the turns. Needs a worktree of the other:
+the same in both. Process time, one thread; medians over the turns. A row of an environment is a
+step of one of its worlds, resets among them. Needs a worktree of the other, and takes a minute:
 
     git worktree add ../other 282192e
-    python benchmarks/against_commit.py ../other [--json F] [--repeats 5]
+    python benchmarks/against_commit.py ../other [--json F] [--repeats 3]
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 
 SIZES = ((4, 5), (10, 6))
+SCENE = "auv_buoys"
 BODIES, EPOCHS = 1024, 512
 
 
@@ -30,7 +32,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("other", nargs="?", help="a worktree of the other commit")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", metavar="F")
     parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -48,7 +50,7 @@ def main() -> None:
         columns = {tree: [run[key] for run in runs] for tree, runs in times.items()}
         row = side_by_side.against(columns["peer"], {name: columns["ours"]})
         results.setdefault(size, {}).update(row)
-    side_by_side.print_rows(results, "M x N", "one of", "other")
+    side_by_side.print_rows(results, "", "one of", "other")
     side_by_side.write(results, options.json)
 
 
@@ -67,13 +69,17 @@ def in_tree(tree: Path) -> dict[str, float]:
 
 def measure() -> dict[str, float]:
     """Seconds of each job by its size and name: the median of some runs after a first one."""
-    return {
-        f"{m}x{n} {name}": seconds for m, n in SIZES for name, seconds in measure_size(m, n).items()
-    }
+    jobs = {f"{m}x{n} {name}": job for m, n in SIZES for name, job in jobs_of_size(m, n).items()}
+    jobs |= {f"env {name}": job for name, job in environment_jobs().items()}
+    result = {}
+    for name, job in jobs.items():
+        job.run()
+        result[name] = float(np.median([side_by_side.seconds(job) for _ in range(3)]))
+    return result
 
 
-def measure_size(m: int, n: int) -> dict[str, float]:
-    """Seconds of each job with m anchors and n tags, by its name."""
+def jobs_of_size(m: int, n: int) -> dict[str, side_by_side.Job]:
+    """Each job with m anchors and n tags, by its name."""
     from rbl_gym import bodies, estimators, motion, ranging, rotations  # those of the tree
 
     rng = np.random.default_rng([m, n])
@@ -90,6 +96,10 @@ def measure_size(m: int, n: int) -> dict[str, float]:
     two = estimators.make("iekf", **laws, iterations=2)
     four = estimators.make("iekf", **laws, iterations=4)
     state, one = two.initial(*prior), four.initial(near[0], place[0], prior[2])
+    laws["noise"] = ranging.SquaredRangeNoise(0.05)
+    linear = estimators.make("kf", **laws, weights=np.ones(m))
+    one_covariance = linear.initial(*prior)
+    to_common = ranging.simulate(anchors[0], tags, rotation, translation, noise, rng).ranges
 
     def one_body() -> None:
         for _ in range(100):
@@ -103,18 +113,45 @@ def measure_size(m: int, n: int) -> dict[str, float]:
     def at_once() -> None:
         estimators.locate(ranges[:EPOCHS], anchors[:EPOCHS], tags, noise, "ml")
 
-    jobs = {
-        "update, 1024 bodies": (lambda: two.update(state, ranges, anchors), BODIES),
-        "epoch, one body": (one_body, 100),
-        "locate, one epoch": (one_by_one, 20),
-        "locate, 512 epochs": (at_once, EPOCHS),
+    def common_weights() -> None:
+        after = linear.predict(one_covariance, twist[0], 0.1)
+        linear.update(after, to_common, anchors[0])
+
+    return {
+        "update, 1024 bodies": side_by_side.Job(lambda: two.update(state, ranges, anchors), BODIES),
+        "epoch, one body": side_by_side.Job(one_body, 100),
+        "kf, common weights": side_by_side.Job(common_weights, BODIES),
+        "locate, one epoch": side_by_side.Job(one_by_one, 20),
+        "locate, 512 epochs": side_by_side.Job(at_once, EPOCHS),
     }
-    result = {}
-    for name, (run, count) in jobs.items():
-        run()
-        runs = [side_by_side.seconds(side_by_side.Job(run, count)) for _ in range(5)]
-        result[name] = float(np.median(runs))
-    return result
+
+
+def environment_jobs() -> dict[str, side_by_side.Job]:
+    """Whole episodes of the vector environment: alone, with the bound, with the filter."""
+    import gymnasium as gym
+
+    from rbl_gym.wrappers import VectorEstimatePose  # that of the tree
+
+    def worlds(reward: str) -> Any:
+        return gym.make_vec("rbl_gym:RBL/Tracking-v0", BODIES, scene=SCENE, reward=reward)
+
+    def episode(envs: Any) -> side_by_side.Job:
+        steps = envs.unwrapped.scene.steps + 1
+        envs.reset(seed=0)
+        actions = np.zeros(envs.action_space.shape, envs.action_space.dtype)
+
+        def run() -> None:
+            for _ in range(steps):
+                envs.step(actions)
+
+        return side_by_side.Job(run, BODIES * steps)
+
+    filtered = VectorEstimatePose(worlds("none"), "iekf", options={"iterations": 2})
+    return {
+        "no reward": episode(worlds("none")),
+        "bound": episode(worlds("bound")),
+        "iekf, 2 iterations": episode(filtered),
+    }
 
 
 if __name__ == "__main__":
