@@ -11,7 +11,7 @@ import pytest
 from rbl_gym import motion, recordings
 from rbl_gym.app import reports
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings import Truth
+from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay.truth import check_overlap, matched, stamp_hints
 from tests.recorded import curve, honest_track
@@ -174,6 +174,49 @@ def test_a_constant_fault_is_hinted(name, step_s):
     result = outcome(Truth(truth.times[some], truth.rotation[some], truth.translation[some]))
     assert len(result["notes"]) == 1, result["notes"]
     assert re.search(words, result["notes"][0]), result["notes"]
+
+
+def floor_run(count, swapped, late_s=0.3):
+    """A planar log of tags on the x axis of a body that faces its way; x and y swapped or not."""
+    times = 0.1 * np.arange(300)
+    truth_times = 0.05 * np.arange(-20, 640)
+
+    def pose(t):
+        place = np.stack([6 + 4 * np.sin(0.21 * t), 4 + 2.4 * np.sin(0.42 * t + 0.3), 0 * t], -1)
+        yaw = np.arctan2(2.4 * 0.42 * np.cos(0.42 * t + 0.3), 4 * 0.21 * np.cos(0.21 * t))
+        return rotations.exp(yaw[:, None] * [0.0, 0, 1]), place
+
+    anchors = np.array([[0, 0, 0], [12, 0, 0], [12, 8, 0], [0, 8, 0], [6, 0, 0], [6, 8, 0.0]])
+    tags = np.array([[0.3, 0, 0], [-0.3, 0, 0]])[:count]
+    rotation, place = pose(times)
+    points = place[:, None] + tags @ np.swapaxes(rotation, 1, 2)
+    exact = np.linalg.norm(points[:, None] - anchors[:, None], axis=-1)
+    ranges = exact + 0.05 * np.random.default_rng(2).standard_normal(exact.shape)
+    ids = tuple("abcdef"), tuple("xy"[:count])
+    anchors = anchors[:, [1, 0, 2]] if swapped else anchors
+    told = Truth(truth_times + late_s, *pose(truth_times))
+    return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, told)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_swapped_axes_of_the_anchors_are_hinted_on_a_floor(count):
+    """The ranges fit the mirrored layout, and an aligned frame has no heading of its own."""
+    for given in (
+        {},
+        {"align": "yaw"},
+        {"align": "yaw", "time_offset": "auto"},
+        {"align": "position"},
+    ):
+        settings = replay.Settings.of(planar=True, range_std_m=0.05, **given)
+        late = 0.3 if "time_offset" in given else 0.0
+        for swapped in (False, True):
+            found = replay.replay_recording(floor_run(count, swapped, late), settings).figures
+            hints = [n for n in found["notes"] if "mirror image of the truth: x and y" in n]
+            assert [n.startswith("WARNING") for n in hints] == [True] * swapped, found["notes"]
+            assert found["position_rmse_m"] > 1 or not swapped
+    settings = replay.Settings.of(planar=True, range_std_m=0.05, time_offset="auto")
+    with pytest.raises(ValueError, match=r"time_offset 'auto'.*; x and y of the anchors \(or of "):
+        replay.replay_recording(floor_run(count, True), settings)
 
 
 def test_a_shift_is_hinted_even_if_the_beliefs_are_wide():

@@ -95,7 +95,7 @@ def _together(one: TimeOffset, other: TimeOffset) -> TimeOffset:
     apart = abs(offsets[0] - offsets[1])
     std = float(np.sqrt(1 / (1 / variance).sum()))
     if apart > _APART * np.sqrt(variance.sum()):
-        std = max(std, 0.5 * apart)
+        std = max(std, 0.5 * float(apart))
     mean = offsets[0] + (offsets[1] - offsets[0]) * variance[0] / variance.sum()
     return TimeOffset(float(mean), std, max(one.correlation, other.correlation))
 

@@ -24,7 +24,14 @@ from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.smoothing import SmoothedRecording
 from rbl_gym.studies.replay.tracking import Track, range_std_of
-from rbl_gym.studies.replay.truth import Judged, fault_hints, judged_of, matched, stamp_hints
+from rbl_gym.studies.replay.truth import (
+    MIRROR_IMAGE,
+    Judged,
+    fault_hints,
+    judged_of,
+    matched,
+    stamp_hints,
+)
 
 __all__ = ["track_figures"]
 
@@ -196,7 +203,8 @@ def _notes(
         if _truth_at_mirror(recording, track, found, settings):
             notes.append("Note: the truth is at the mirror pose.")
         else:
-            notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, found, settings)]
+            for hint in _fault_hints(recording, track, found, settings):
+                notes.append(f"{'WARNING' if hint.startswith(MIRROR_IMAGE) else 'Note'}: {hint}.")
     return {**result, "notes": notes}
 
 

@@ -29,6 +29,8 @@ __all__ = ["Replayed", "check_replay", "replay_recording"]
 
 # Correlation of the motions below which an estimated time offset is reported as unreliable.
 _RELIABLE = 0.9
+# Standard deviation (s) above which it is.
+_VAGUE_S = 0.25
 
 
 class Replayed(NamedTuple):
@@ -104,7 +106,7 @@ def replay_recording(
     if settings.comparison.time_offset == "auto":
         # A smoothed track has no lag.
         best = track if smoothed is None else smoothed.track
-        offset = find_offset(recording, best, settings)
+        offset = _offset_of(recording, best, settings, track)
         settings = with_offset(settings, offset)
     errors = track_errors(recording, track, settings)
     figures = track_figures(recording, track, errors, settings)
@@ -121,14 +123,46 @@ def replay_recording(
     return Replayed(settings, track, errors, figures, smoothed, smoothed_errors)
 
 
+def _offset_of(
+    recording: Recording, best: Track, settings: Settings, causal: Track
+) -> TimeOffset | None:
+    """Return the clock offset of the truth; a ValueError names a fault that prevents it."""
+    try:
+        return find_offset(recording, best, settings)
+    except ValueError as error:
+        hint = _axes_hint(recording, best, settings)
+        if not hint:
+            causes = diagnose(recording, settings, causal)[0]["causes"]
+            hint = "".join(f"; {cause['text']}" for cause in causes)
+        raise ValueError(f"{error}{hint}") from error
+
+
+def _axes_hint(recording: Recording, track: Track, settings: Settings) -> str:
+    """Return words if the motions agree with x and y of the track swapped."""
+    swap = np.eye(3)[[1, 0, 2]]
+    swapped = track._replace(
+        rotation=swap @ track.rotation @ swap, translation=track.translation @ swap
+    )
+    try:
+        found = find_offset(recording, swapped, settings)
+    except ValueError:
+        return ""
+    if found is None or found.correlation < _RELIABLE:
+        return ""
+    return (
+        "; x and y of the anchors (or of the truth) look swapped: with them exchanged the motions "
+        f"agree (correlation {found.correlation:.2f})"
+    )
+
+
 def _offset_note(found: TimeOffset) -> list[str]:
-    if found.correlation >= _RELIABLE:
+    if found.correlation >= _RELIABLE and found.std_s <= _VAGUE_S:
         return []
     return [
         f"WARNING: the estimated time offset of the truth, {found.offset_s:.3f} s, is unreliable: "
-        f"the motion of track and truth has a correlation of only {found.correlation:.2f}. Check "
-        "that both are of one run, and the positions of the anchors, or give the offset in seconds "
-        "(--time-offset S)."
+        f"its standard deviation is {found.std_s:.2g} s and the correlation of the motions of "
+        f"track and truth {found.correlation:.2f}. Check that both are of one run, and the "
+        "positions of the anchors, or give the offset in seconds (--time-offset S)."
     ]
 
 

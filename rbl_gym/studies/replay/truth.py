@@ -28,6 +28,13 @@ _FEWEST = 4
 _SHIFTS, _FINE_SHIFTS = np.linspace(-3.0, 3.0, 31), np.linspace(-0.15, 0.15, 7)
 # Angle within which a turn is taken for a half turn, and its axis for horizontal or diagonal.
 _NEAR_RAD = math.radians(15.0)
+# Variance above which a rotation is undetermined.
+_OPEN_RAD2 = 1.0
+# Begins the hint at a reflection of planar motion.
+MIRROR_IMAGE = (
+    "the track is a mirror image of the truth: x and y of the anchors (or of the truth) look "
+    "swapped, or one of their axes inverted"
+)
 _SI = ((1e-3, "milli", "ms"), (1e-6, "micro", "us"), (1e-9, "nano", "ns"))
 
 
@@ -146,11 +153,12 @@ class Judged(NamedTuple):
         return float((place / self.place_variance).mean())
 
     def rmse(self) -> str:
-        """Return the root mean square errors of position and rotation, as text."""
+        """Return the root mean square errors of position and determined rotation, as text."""
         turn = rotations.error(self.rotation, self.true_rotation)
         place = self.translation - self.true_translation
         turn_deg, place_m = (np.sqrt((a**2).sum(-1).mean()) for a in (np.rad2deg(turn), place))
-        return f"{place_m:.3g} m" + (f" and {turn_deg:.3g} deg" if self.has_rotation else "")
+        known = self.has_rotation and np.median(self.turn_variance) < _OPEN_RAD2
+        return f"{place_m:.3g} m" + (f" and {turn_deg:.3g} deg" if known else "")
 
 
 def fault_hints(
@@ -206,6 +214,8 @@ def fault_hints(
         if best is None:
             break
         hints.append(f"{best[1]}: the errors would be {best[2].rmse()} instead of {judged.rmse()}")
+        if best[1].startswith(MIRROR_IMAGE):
+            break  # an offset of the body would only turn its mirrored tags
         judged, faults = best[2], []
     return hints or shifts
 
@@ -272,7 +282,11 @@ def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
 
 
 def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
-    """Yield the rigid transforms of the world and of the body with the smallest errors."""
+    """Yield the rigid transforms of the world and of the body with the smallest errors.
+
+    Planar motion may also be mirrored: in the plane, a half turn about a horizontal axis is a
+    reflection.
+    """
     p, q, Q = judged.translation, judged.true_translation, judged.true_rotation
     # Beliefs at the start, which are uncertain, have less weight.
     w, u = (1 / np.maximum(a, np.median(a)) for a in (judged.place_variance, judged.turn_variance))
@@ -281,13 +295,16 @@ def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
     turns = np.einsum("k,kij,klj->il", u, judged.rotation, Q) * judged.has_rotation
     # Weight of the path relative to the rotations; a path that does not move has none.
     trust = np.median(judged.turn_variance) / np.median(judged.place_variance)
-    R = rotations.nearest(turns + trust * np.einsum("k,ki,kj->ij", w, *spread))
+    moves = trust * np.einsum("k,ki,kj->ij", w, *spread)
+    R = _turn_about_z(turns + moves) if planar else rotations.nearest(turns + moves)
     shift = w @ (p - q @ R.T)
     yield (
         f"a constant offset of the truth's world frame, {_words(R, shift)}{_mirrored(R)}; "
         "see --align",
         judged._replace(true_rotation=R @ Q, true_translation=q @ R.T + shift),
     )
+    if planar:
+        yield _mirror_image(judged, u, w, moves)
     if not judged.has_rotation:
         return
     turned = np.swapaxes(Q, 1, 2)
@@ -298,6 +315,32 @@ def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
     yield (
         f"a constant offset of the truth's body frame, {_words(C, arm)}",
         judged._replace(true_rotation=Q @ C, true_translation=q + Q @ arm),
+    )
+
+
+def _turn_about_z(correlation: FloatArray) -> FloatArray:
+    """Return the rotation about z nearest to a matrix (3, 3)."""
+    angle = np.arctan2(correlation[1, 0] - correlation[0, 1], correlation[0, 0] + correlation[1, 1])
+    return rotations.exp([0.0, 0.0, angle])
+
+
+def _mirror_image(
+    judged: Judged, u: FloatArray, w: FloatArray, moves: FloatArray
+) -> tuple[str, Judged]:
+    """Return planar truth reflected in the line that leaves the smallest errors."""
+    p, q = judged.translation, judged.true_translation
+    across = np.diag([1.0, -1.0, 1.0])
+    yaws = [rotations.yaw(Q) for Q in (judged.rotation, judged.true_rotation)]
+    # A reflection is one in the x axis, then a turn; it changes the sign of a heading.
+    turns = np.zeros((3, 3))
+    turns[:2, :2] = np.einsum(
+        "k,ki,kj->ij", u, *(np.stack([np.cos(a), np.sin(a)], axis=-1) for a in (yaws[0], -yaws[1]))
+    )
+    turn = _turn_about_z(turns * judged.has_rotation + moves @ across)
+    F = turn @ across
+    image = turn @ rotations.exp(-yaws[1][:, None] * [0.0, 0.0, 1.0])
+    return MIRROR_IMAGE, judged._replace(
+        true_rotation=image, true_translation=q @ F.T + w @ (p - q @ F.T)
     )
 
 
