@@ -242,6 +242,21 @@ def test_the_rotation_of_one_tag_has_no_number():
         assert rows["position xyz (m)"][0] == f"{figures['position_rmse_m']:.4f}"
 
 
+def test_a_table_of_runs_has_no_angles_of_one_tag(capsys):
+    """Nor has the row of all runs together; runs of two tags have them."""
+    settings = replay.Settings.of(planar=True, smooth=True)
+    for count in (1, 2):
+        logs = {run: floor_run(count, False, 0.0).part(slice(40)) for run in "ab"}
+        figures = replay.replay_runs(logs, settings).figures
+        reports.print_runs(figures)
+        said = capsys.readouterr().out
+        angles = [f"{one['yaw_rmse_deg']:.2f}" for one in figures["runs"].values()]
+        assert "together" in said
+        assert "smoothed" in said
+        assert said.count("undetermined") == (6 if count == 1 else 0)
+        assert all((angle in said) == (count == 2) for angle in angles)
+
+
 def test_a_truth_without_heights_hints_at_the_floor():
     told = Truth(*moving(0.1))._replace(planar=True)
     for settings, hinted in (

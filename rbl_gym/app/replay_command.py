@@ -237,6 +237,11 @@ def _replay(options: argparse.Namespace) -> int:
     runs = read_runs(options)
     # Report errors before the work begins.
     _check_compared(options, runs)
+    if len(runs) > 1 and (options.plot or options.html or options.track):
+        raise ValueError(
+            f"--plot, --html and --track need a single run, but {options.ranges} has {len(runs)}, "
+            f"{[*runs]!r:.200}: choose one by --run"
+        )
     for recording in runs.values() if len(runs) == 1 else ():
         replay.check_replay(recording, settings)
     settings, clocks = found_clocks(options, runs, settings)
@@ -293,11 +298,6 @@ def _replay_runs(
     from rbl_gym.app import reports
     from rbl_gym.studies import replay
 
-    if options.plot or options.html or options.track:
-        raise ValueError(
-            f"--plot, --html and --track need a single run, but {options.ranges} has {len(runs)}, "
-            f"{[*runs]!r:.200}: choose one by --run"
-        )
     with progress("replay", sum(len(run.times) for run in runs.values())) as advance:
         replayed = replay.replay_runs(runs, settings, advance)
     replayed.figures.update(clocks)

@@ -124,9 +124,9 @@ def print_replay(result: dict[str, Any]) -> None:
 
 
 def turn_open(result: dict[str, Any]) -> bool:
-    """Return whether the body has one tag, and nothing determines its rotation."""
+    """Return whether the body has one tag, and nothing determines its rotation or its yaw."""
     one = "centre_rmse_m" in result and "axis_rmse_deg" not in result
-    return one and "the rotation" in result["undetermined"]
+    return one and any(what.startswith("the rotation") for what in result["undetermined"])
 
 
 def error_rows(result: dict[str, Any], axes: str, is_open: bool) -> Iterator[tuple[str, list[str]]]:
@@ -166,32 +166,49 @@ def _print_errors(
     )
 
 
+_RUN_COLUMNS = (
+    ("position_rmse_m", 4),
+    ("position_median_m", 4),
+    ("yaw_rmse_deg", 2),
+    ("yaw_mean_deg", 2),
+    ("anees", 2),
+)
+
+
 def print_runs(result: dict[str, Any]) -> None:
     """Print the figures of several runs, a row each, and of all together."""
     console = new_console()
-    every = {**result["runs"], "together": result["together"]}
-    columns = [
-        (name, places)
-        for name, places in (
-            ("position_rmse_m", 4),
-            ("position_median_m", 4),
-            ("yaw_rmse_deg", 2),
-            ("yaw_mean_deg", 2),
-            ("anees", 2),
-        )
-        if name in result["together"]
-    ]
-    headings = ["epochs", "with truth", *(name.replace("_", " ") for name, _ in columns)]
-    table = new_table(None, ["run"], headings)
-    for run, one in every.items():
-        cells = [f"{one[name]:.{places}f}" if name in one else "" for name, places in columns]
-        table.add_row(run, str(one["epochs"]), str(one.get("epochs_with_truth", 0)), *cells)
-    console.print(table)
+    opened = {run: turn_open(one) for run, one in result["runs"].items()}
+    _print_runs(console, "run", result["runs"], result["together"], opened)
+    if "smoothed" in result["together"]:
+        runs = {run: one["smoothed"] for run, one in result["runs"].items()}
+        _print_runs(console, "smoothed", runs, result["together"]["smoothed"], opened)
     notes = [one["notes"] for one in result["runs"].values()]
     common = [note for note in notes[0] if all(note in others for others in notes)]
     _print_notes(console, {"notes": common})
     if own := sum(len(others) > len(common) for others in notes):
         console.print(f"{own} of {len(notes)} runs have other notes: see --run or --json")
+
+
+def _print_runs(
+    console: Any, title: str, runs: dict[str, Any], together: Any, opened: dict[str, bool]
+) -> None:
+    """Print a table of runs; without angles for those in `opened`, whose turn is open."""
+    every = {**runs, "together": together}
+    opened = {**opened, "together": any(opened.values())}
+    counts = [name for name in ("epochs", "epochs_with_truth") if name in together]
+    columns = [(name, places) for name, places in _RUN_COLUMNS if name in together]
+    headings = [name.replace("_", " ") for name in (*counts, *(name for name, _ in columns))]
+    table = new_table(None, [title], headings)
+    for run, one in every.items():
+        cells = [str(one.get(name, 0)) for name in counts]
+        for name, places in columns:
+            cell = f"{one[name]:.{places}f}" if name in one else ""
+            if opened[run] and name.endswith("deg"):
+                cell = "undetermined" if name == "yaw_rmse_deg" else ""
+            cells.append(cell)
+        table.add_row(run, *cells)
+    console.print(table)
 
 
 def compared(result: dict[str, Any]) -> list[str]:
