@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 from scipy.spatial.transform import Rotation
 
 from rbl_gym.app.cli import main
@@ -222,12 +223,18 @@ def test_clock_by_hand():
     assert clock.std_s < 0.01
 
 
-def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way():
-    """A tag further ahead looks like a later clock, and lost ranges change what is known."""
+@pytest.mark.parametrize(
+    ("lasts_s", "path_std", "seeds"), [(60, 0.0, 4), (60, 0.01, 4), (20, 0.0, 4)]
+)
+def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way(lasts_s, path_std, seeds):
+    """A tag further ahead looks like a later clock, and lost ranges change what is known.
+
+    A path with noise (m and rad) has large rates, and a short log leaves few blocks of time.
+    """
     hall = np.array(
         [[0, 0, 2.6], [12, 0, 2.2], [12, 8, 2.7], [0, 8, 2.3], [6, 0, 1.2], [6, 8, 1.5]]
     )
-    z, times, tags = [], 0.1 * np.arange(600), TAGS[:2]
+    z, times, tags = [], np.arange(0, lasts_s, 0.1), TAGS[:2]
 
     def pose(at):
         w = 0.21
@@ -238,23 +245,26 @@ def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way():
     rotation, place = pose(times)
     places = place[:, None] + tags @ np.swapaxes(rotation, -1, -2)
     d = np.linalg.norm(places[:, None] - hall[:, None], axis=-1)
-    on_truth = np.arange(0, 60, 0.02)
-    truth = Truth(on_truth + 0.3, *pose(on_truth))
+    on_truth = np.arange(0, lasts_s, 0.02)
     settings = calibrate.LinkSettings(slopes=False, planar=True)
-    for seed in range(6):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         ranges = d + 0.08 * rng.standard_normal(d.shape)
         ranges += np.where(rng.random(d.shape) < 0.05, rng.uniform(0.5, 4, d.shape), 0)
         ranges[rng.random(d.shape) < 0.1] = 0
+        turned, moved = pose(on_truth)
+        moved = moved + path_std * rng.standard_normal(moved.shape)
+        yaw = path_std * rng.standard_normal((len(moved), 1)) * [0.0, 0.0, 1.0]
+        truth = Truth(on_truth + 0.3, Rotation.from_rotvec(yaw).as_matrix() @ turned, moved)
         recording = recording_of(times, ranges, truth, tags)._replace(anchors=hall)
         found = calibrate.calibrate_links(recording, settings)
         assert found.clock is not None
-        assert found.clock.std_s < 0.02
+        assert found.clock.std_s < (0.02 if lasts_s == 60 else 0.201)
         z.append((found.clock.offset_s - 0.3) / found.clock.std_s)
         assert (np.abs(found.fit.tags - tags)[:, :2] < 5 * found.fit.tags_std_m[:, :2] + 1e-3).all()
-    # Six squared deviations, sum below its 99.99 % point for Gaussian ones.
+    # Squared deviations: the largest below 4 sigma, the sum below its 99.99 % point.
     assert np.abs(z).max() < 4
-    assert np.square(z).sum() < 28
+    assert np.square(z).sum() < scipy.stats.chi2.ppf(0.9999, seeds)
 
 
 @pytest.mark.parametrize("slopes", [True, False])

@@ -48,6 +48,21 @@ def test_smoothed_is_nearer_than_causal_and_honest():
     )
 
 
+def test_a_covariance_wider_than_the_errors_names_the_assumed_errors():
+    """Biases that a log does not have; none if the log is as assumed."""
+    log = flight(TAGS)
+    good = {"smooth_constant_m": 0.0, "smooth_common_m": 0.0, "smooth_bias_std_m": 0.0}
+    for changed, wide in (({}, True), ({**good, "robust": False}, False)):
+        figures = replay.replay_recording(log, SMOOTH.changed(**changed)).figures
+        assert (figures["smoothed"]["anees"] < 0.4) == wide
+        notes = [note for note in figures["notes"] if "smoothed track is too large" in note]
+        assert len(notes) == wide
+        assert not wide or "0.05 m, and biases of 0.1 m (each link), 0.2 m (common)" in notes[0]
+    replayed = replay.replay_recording(log._replace(truth=None), SMOOTH.changed(range_std_m=0.15))
+    (note,) = [n for n in replayed.figures["notes"] if "smoothed track" in n]
+    assert f"NIS {replayed.figures['smoothed']['nis']:.2f}" in note
+
+
 @with_kernels
 def test_moving_anchors_and_coordinates_of_a_map():
     near = replay.replay_recording(flight(TAGS, swaying), SMOOTH)

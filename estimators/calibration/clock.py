@@ -20,11 +20,12 @@ __all__ = ["Clock", "find_clock"]
 # multiple of it. Longer ones carry more information, shorter ones contain less of slow errors.
 _LAGS_S, _LONGEST = (0.2, 0.4, 0.8), 3.0
 _SEARCH_STEP_S, _FEWEST, _BLOCK_S = 0.1, 30, 2.0
-# Half-width of the finite difference for rates (s).
-_HALF_S = 0.02
+# Shifts (s) of the finite differences for rates. Rates over a short time would contain the noise of
+# the path: they would look large, and the offset certain.
+_NEAR_S = np.array([0.05, 0.1, 0.15, 0.2, 0.25])
 _LEAST_M = 1e-4
-# Gauss-Newton steps at most, and the step (s) below which they end.
-_STEPS, _CLOSE_S = 20, 1e-5
+# Gauss-Newton steps at most, the step (s) below which they end, and how often rates are renewed.
+_STEPS, _CLOSE_S, _ROUNDS = 20, 1e-5, 2
 
 Places = Callable[[float], tuple[FloatArray, BoolArray]]
 
@@ -99,6 +100,13 @@ class _Changes(NamedTuple):
         foretold, known = self.foretold(shift)
         return self.change - foretold, known
 
+    def rate(self, shift: float) -> FloatArray:
+        """Return the rates (P,) of the predicted changes: least squares over near shifts."""
+        rise = sum(
+            near * (self.left(shift - near)[0] - self.left(shift + near)[0]) for near in _NEAR_S
+        )
+        return rise / (2 * (_NEAR_S**2).sum())
+
     def spread(self, shift: float) -> float:
         """Return the robust standard deviation of the residual changes."""
         e, known = self.left(shift)
@@ -112,46 +120,68 @@ def _refined(changes: _Changes, start: float, moves: FloatArray) -> Clock | None
     """
     half = 1.5 * _SEARCH_STEP_S
     # One set of changes for all shifts: the loss would jump where a change enters or leaves.
-    ends = start - half - _HALF_S, start, start + half + _HALF_S
+    ends = start - half - _NEAR_S[-1], start, start + half + _NEAR_S[-1]
     known = np.all([changes.left(shift)[1] for shift in ends], axis=0)
     if known.sum() < _FEWEST:
         return None
     std = float(robust.spread(changes.left(start)[0], known, _LEAST_M))
     moved = changes.of(moves)[known] / std
     offset, move = start, np.zeros(moved.shape[-1])
-    z = share = own = rate = np.empty(0)  # of the last step
-    for _ in range(_STEPS):
-        z = changes.left(offset)[0][known] / std - moved @ move
-        rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]
-        rate = rate[known] / (2 * _HALF_S * std)
-        share = robust.share_of(z)
-        # The part of the rates that no move of the tags explains tells the clock.
-        weighted = moved * share[:, None]
-        inverse = np.linalg.inv(weighted.T @ moved + np.eye(len(move)))
-        own = rate - moved @ (inverse @ (weighted.T @ rate))
-        information = float((share * own * rate).sum())
-        if not information > 0:
-            return None
-        step = float((own * share * (z + moved @ move)).sum()) / information
-        step = float(np.clip(step, -_SEARCH_STEP_S, _SEARCH_STEP_S))
-        offset += step
-        move = inverse @ (weighted.T @ (z + moved @ move - rate * step))
-        if abs(offset - start) > half:
-            return None
-        if abs(step) < _CLOSE_S:
-            break
-    # Changes overlap and errors are correlated, so scores are summed over blocks of time first.
-    block = np.unique((changes.times[known] // _BLOCK_S).astype(int), return_inverse=True)[1]
-    score = np.bincount(block, z * share * own)
-    # Late ranges lower the curvature of the loss.
-    curvature = np.where(share < 1, -share, 1.0).mean()
-    information = max(float(curvature), 0.1) * float((own * rate).sum())
-    unknowns = 1 + len(move)
-    if not (information > 0 and len(score) > unknowns):
+    z = share = rate = np.empty(0)  # of the last step
+    for _ in range(_ROUNDS):
+        rate = changes.rate(offset)[known] / std
+        for _ in range(_STEPS):
+            z = changes.left(offset)[0][known] / std - moved @ move
+            share = robust.share_of(z)
+            # The part of the rates that no move of the tags explains tells the clock.
+            weighted = moved * share[:, None]
+            inverse = np.linalg.inv(weighted.T @ moved + np.eye(len(move)))
+            own = rate - moved @ (inverse @ (weighted.T @ rate))
+            information = float((share * own * rate).sum())
+            if not information > 0:
+                return None
+            step = float((own * share * (z + moved @ move)).sum()) / information
+            step = float(np.clip(step, -_SEARCH_STEP_S, _SEARCH_STEP_S))
+            offset += step
+            move = inverse @ (weighted.T @ (z + moved @ move - rate * step))
+            if abs(offset - start) > half:
+                return None
+            if abs(step) < _CLOSE_S:
+                break
+    return _jackknifed(offset, changes.times[known], z, share, np.column_stack([rate, moved]))
+
+
+def _jackknifed(
+    offset: float, times: FloatArray, z: FloatArray, share: FloatArray, rates: FloatArray
+) -> Clock | None:
+    """Return an offset with its standard deviation from estimates without each block of time.
+
+    Changes overlap and their errors are correlated, so whole blocks are left out. Blocks in which
+    the body turns or stops determine the offset and the tags more than others: unlike the sum of
+    squared scores, the jackknife allows for this. `rates` (P, 1 + D) are the derivatives of the
+    residuals z (P,) by the offset and the moves of the tags.
+    """
+    block = np.unique((times // _BLOCK_S).astype(int), return_inverse=True)[1]
+    count, width = int(block.max()) + 1, rates.shape[1]
+    freedom = count - 1 - width
+    if freedom <= 2:
         return None
-    # The residuals are smaller than the errors: the unknowns are fitted to them.
-    factor = len(score) / (len(score) - unknowns)
-    return Clock(offset, float(np.sqrt(factor * (score**2).sum()) / information))
+    # Late ranges lower the curvature of the loss.
+    curvature = max(float(np.where(share < 1, -share, 1.0).mean()), 0.1)
+    prior = np.diag([0.0, *np.ones(width - 1)])
+    score, information = np.zeros((count, width)), np.zeros((count, width, width))
+    np.add.at(score, block, (share * z)[:, None] * rates)
+    for i in range(count):
+        mine = rates[block == i]
+        information[i] = curvature * mine.T @ mine
+    left = information.sum(axis=0) - information + prior
+    if not (np.linalg.eigvalsh(left)[:, 0] > 0).all():
+        return None
+    without = np.linalg.solve(left, -score[..., None])[:, 0, 0]
+    variance = (count - 1) / count * np.square(without - without.mean()).sum()
+    # Few blocks: the variance is itself uncertain, and the error has Student's distribution.
+    variance *= freedom / (freedom - 2)
+    return Clock(offset, float(np.sqrt(variance)))
 
 
 def _changes(

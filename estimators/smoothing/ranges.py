@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.costs.losses import SQUARES, loss_of
+from rbl_gym.estimators.costs.losses import SQUARES, expected_square, loss_of
 from rbl_gym.estimators.costs.range_cost import offset_of
 from rbl_gym.estimators.smoothing.equations import Equations, LogState, Rows
 from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
@@ -254,7 +254,8 @@ class LogRanges:
     ) -> tuple[FloatArray, FloatArray]:
         """Return squared whitened residuals (..., K) of the epochs, and their expectation.
 
-        The expectation per range is 1 less the fraction of its variance that the fit explains.
+        The expectation per range is 1 less the fraction of its variance that the fit explains,
+        times that of the loss (`expected_square`).
         """
         (r, A, _, C), _ = self.rows(state, loss)
         P, crossed, constants = covariances
@@ -266,7 +267,7 @@ class LogRanges:
         if self.offset is not None:
             there = (self.spread(self.weights) > 0).any(axis=axes_of(self.offset), keepdims=True)
             free = free - there.sum(axis=(-2, -1))
-        return (r**2).sum(axis=-1), free
+        return (r**2).sum(axis=-1), free * expected_square(loss)[..., None]
 
     def spread(self, values: FloatArray) -> FloatArray:
         """Return values (..., K, S) as (..., K, M, N), zero where no range was measured."""

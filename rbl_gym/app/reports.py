@@ -106,7 +106,7 @@ def print_replay(result: dict[str, Any]) -> None:
         unsettled = "" if fit["converged"] else ", NOT converged"
         console.print(
             f"smoothed in {fit['seconds']:.1f} s{unsettled}, NIS per degree of freedom "
-            f"{fit['nis']:.2f}"
+            f"{fit['nis']:.2f} (1: consistent)"
         )
     if "epochs_with_truth" not in result:
         console.print("no truth, so no errors")

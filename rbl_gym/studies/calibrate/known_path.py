@@ -23,8 +23,9 @@ from rbl_gym.recordings import truth_at
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
-# Range of tested time shifts (s), and largest standard deviation of an accepted clock.
-_SEARCH_S, _CLOCK_STD_S = 1.0, 0.05
+# Range of tested time shifts (s), and largest standard deviation of an accepted clock: if the tags
+# are known, and if their moves are estimated with it.
+_SEARCH_S, _CLOCK_STD_S, _WITH_TAGS_STD_S = 1.0, 0.05, 0.2
 # Number of epochs for coarse starts, and the ratio of misfits below which a rotation is accepted.
 _COARSE, _BETTER = 400, 0.8
 
@@ -145,7 +146,7 @@ def clock_of(
     """Estimate how far the clock of the truth is ahead, from ranges; None if undetermined.
 
     `tags` (N, 3) in the body frame of the truth. With a `model` whose tags are not held, their
-    turn and shift are unknown.
+    turn and shift are unknown, and the clock may be less certain.
     """
 
     def distances(shift: float) -> tuple[FloatArray, BoolArray]:
@@ -163,4 +164,5 @@ def clock_of(
     free = model is not None and model.tags != "held"
     search = log.times, log.ranges, log.links, distances, _SEARCH_S
     found = find_clock(*search, moves if free else None)
-    return found if found is not None and found.std_s <= _CLOCK_STD_S else None
+    most = _WITH_TAGS_STD_S if free else _CLOCK_STD_S
+    return found if found is not None and found.std_s <= most else None

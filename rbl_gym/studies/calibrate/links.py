@@ -30,6 +30,8 @@ __all__ = ["CalibratedLinks", "calibrate_links"]
 
 # A parameter is undetermined if its standard deviation remains above this share of its prior.
 _UNTOLD = 0.5
+# Standard deviation (s) of a clock that the ranges do not separate from the tags.
+_VAGUE_S = 0.2
 # With fewer ranges per link (median), only antenna delays of nodes are estimated.
 _FEW_RANGES = 30
 # Median noise (m) with its slow share, and median slope of the links, beyond which the geometry is
@@ -145,7 +147,12 @@ def calibrate_links(
     if clock is not None:
         # The clock is more accurate once the tags are at their estimated positions.
         coarse = fit_log(log, settings, first, turn, shift, few=True)
-        turn, clock = coarse.rotation, clock_of(log, settings, coarse.tags, first) or clock
+        turn, known = coarse.rotation, clock_of(log, settings, coarse.tags, first)
+        if known is None and first.tags != "held":
+            # The ranges do not separate the clock from the tags, and the first estimate took the
+            # tags as exact.
+            known = Clock(clock.offset_s, _VAGUE_S)
+        clock = known or clock
         shift = clock.offset_s
     advance()
     fit = fit_log(log, settings, first, turn, shift)

@@ -39,6 +39,8 @@ __all__ = ["track_figures"]
 _NEARER = 0.25
 # Epochs further apart than this (s), and than this multiple of the median, leave a gap.
 _GAP_S, _GAP_STEPS = 1.0, 5.0
+# A smoothed track with a NIS or a NEES per degree of freedom below these has a large covariance.
+_WIDE_NIS, _WIDE_NEES = 0.5, 0.4
 # Number of epochs that is sufficient to find a fault of the truth.
 _ENOUGH = 1000
 
@@ -79,6 +81,26 @@ def smoothed_figures(smoothed: SmoothedRecording, found: TrackErrors | None) -> 
         "nis": float(fit.squares.sum() / fit.freedom.sum()),
         "mean_bias_m": fit.biases.mean(axis=0).tolist(),
     } | ({} if found is None else error_figures(found))
+
+
+def wide_note(smoothed: dict[str, Any], settings: dict[str, Any]) -> list[str]:
+    """Return a note if the smoothed covariance is clearly larger than the errors of the log."""
+    nis, nees = smoothed["nis"], smoothed.get("anees", 1.0)
+    if nis > _WIDE_NIS and nees > _WIDE_NEES:
+        return []
+    of, names = "smooth", ("smooth_constant_m", "smooth_common_m", "smooth_bias_std_m")
+    if settings["filter"] == "iekf-imu":
+        of, names = "constant", ("constant_std_m", "constant_common_m", "drift_std_m")
+    each, common, drift = (settings[name] for name in names)
+    std = settings["range_std_m"]
+    noise = "the recorded noise" if std == "recorded" else f"a noise of {std:g} m"
+    seen = f"NEES per degree of freedom {nees:.2f}" if nees <= _WIDE_NEES else f"NIS {nis:.2f}"
+    return [
+        f"Note: the covariance of the smoothed track is too large for this log ({seen}, 1: "
+        f"consistent). It is right for the assumed errors of the ranges: {noise}, and biases of "
+        f"{each:g} m (each link), {common:g} m (common) and {drift:g} m (drifting). If your radios "
+        f"are better, give --range-std-m and --{of}-..."
+    ]
 
 
 def error_figures(found: TrackErrors) -> dict[str, float]:

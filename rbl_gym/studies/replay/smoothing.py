@@ -36,7 +36,7 @@ from rbl_gym.studies.replay.tracking import (
 __all__ = ["SmoothedRecording", "smooth_recording"]
 
 # The start had diverged if squared residuals exceed this multiple of their expectation.
-_LOST = 2.0
+_LOST = 1.5
 # Standard deviations of an unknown turn rate (rad/s) and velocity (m/s).
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
 # Maximum memory (bytes) of the blocks of all epochs.

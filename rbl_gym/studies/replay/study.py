@@ -11,7 +11,7 @@ from rbl_gym.recordings import TimeOffset
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.studies.replay.diagnosis import diagnose
-from rbl_gym.studies.replay.figures import smoothed_figures, track_figures
+from rbl_gym.studies.replay.figures import smoothed_figures, track_figures, wide_note
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
     find_offset,
@@ -120,6 +120,7 @@ def replay_recording(
         return Replayed(settings, track, errors, figures)
     smoothed_errors = track_errors(recording, smoothed.track, settings)
     figures["smoothed"] = smoothed_figures(smoothed, smoothed_errors)
+    figures["notes"] += wide_note(figures["smoothed"], figures["settings"])
     return Replayed(settings, track, errors, figures, smoothed, smoothed_errors)
 
 
