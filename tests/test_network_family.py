@@ -134,7 +134,7 @@ def test_wrong_families_are_named(scenes, message):
 
 
 def test_an_estimator_needs_one_network():
-    with pytest.raises(ValueError, match="scenes must be left out for an estimator"):
+    with pytest.raises(ValueError, match="scenes must be left out: EstimateNetwork"):
         EstimateNetwork(gym.make(ID, scenes=DRAWN))
-    with pytest.raises(ValueError, match="scenes must be left out for an estimator"):
+    with pytest.raises(ValueError, match="scenes must be left out: EstimateNetwork"):
         VectorEstimateNetwork(gym.make_vec(ID, num_envs=2, scenes=DRAWN))

@@ -242,7 +242,9 @@ def iterated_ekf(
                 raise ValueError(f"{name} must be None with angles, got {told!r:.80}")
         return DoaEkf(tags, noise, process, iterations, robust, range_noise=range_noise)
     if range_noise is not None:
-        raise ValueError("range_noise must be None if noise is the law of the ranges")
+        raise ValueError(
+            "range_noise must be None with measurement='ranges', as noise is the law of the ranges"
+        )
     filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
     if anchor_std_m is None:
         return filter if clock is None else ClockEkf(filter, clock=clock)

@@ -111,7 +111,7 @@ class PlanarNetworkVectorEnv(BatchEnv):
     def sensing(self) -> Sensing:
         """What an estimator may know besides the observation; only without `scenes`."""
         if self.family is not None:
-            raise ValueError("scenes must be left out for an estimator, which needs one network")
+            raise ValueError("scenes must be left out: EstimateNetwork needs a single network")
         return self._plan.sensing
 
     @property

@@ -204,7 +204,9 @@ def recorded(
         ("translation", translation, (len(times), 3)),
     ):
         if value.shape != shape:
-            raise ValueError(f"{name} must have shape {shape} as times, got {value.shape}")
+            raise ValueError(
+                f"{name} must have shape {shape}, one for each time, got {value.shape}"
+            )
     dt = check_number("dt", dt, low=1e-12)
     at = np.arange(times[0], times[-1] + 1e-9 * dt, dt)
     if len(at) < 2:

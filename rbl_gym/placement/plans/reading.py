@@ -43,7 +43,7 @@ def read_drawing(
     if suffix == ".dwg":
         raise ValueError(f"{path}: DWG files cannot be read: save the drawing as DXF")
     if suffix not in _SUFFIXES:
-        raise ValueError(f"{path}: a drawing must be one of {', '.join(_SUFFIXES)}")
+        raise ValueError(f"{path}: the name of a drawing must end in one of {', '.join(_SUFFIXES)}")
     known = (*UNITS, "degrees")
     if units is not None and units not in known:
         raise ValueError(f"units must be one of {', '.join(known)}, got {units!r}")

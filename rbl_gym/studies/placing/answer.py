@@ -159,8 +159,8 @@ def _with_kept(problem: Problem, question: Question) -> tuple[Problem, FloatArra
     others = np.delete(layout, kept, axis=0)
     if len(fixed) + len(others) > question.numbers[0]:
         raise ValueError(
-            f"the number of anchors must be at least {len(fixed) + len(others)}, the anchors of "
-            f"the layout and the fixed ones, got {question.numbers[0]}"
+            f"the number of anchors must be at least {len(fixed) + len(others)}, as it includes "
+            f"those of the layout and the fixed ones; got {question.numbers[0]}"
         )
     return dataclasses.replace(problem, fixed=fixed), np.concatenate([fixed, others])
 
