@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
-from scipy import sparse
-from scipy.sparse.linalg import spsolve
 
 from rbl_gym.checks import check_array, check_number
 from rbl_gym.estimators.costs.losses import LATE, huber, loss_of
@@ -76,13 +74,19 @@ def range_track(
     # scipy's stubs lack these types.
     basis: Any = scipy.interpolate.BSpline.design_matrix(inside, knots, 3).tocsr()
     m = basis.shape[1]
-    bend = sparse.eye(m - 2, m) - 2 * sparse.eye(m - 2, m, k=1) + sparse.eye(m - 2, m, k=2)
+    bend = (
+        scipy.sparse.eye(m - 2, m)
+        - 2 * scipy.sparse.eye(m - 2, m, k=1)
+        + scipy.sparse.eye(m - 2, m, k=2)
+    )
     bend = bend / ((length / count) ** 2 * _ACCELERATION)
     link = np.zeros(len(times), dtype=int) if links is None else np.asarray(links, dtype=int)
     count = int(link.max()) + 1
-    of_link = sparse.csr_matrix((np.ones(len(link)), (np.arange(len(link)), link)))
+    of_link = scipy.sparse.csr_matrix((np.ones(len(link)), (np.arange(len(link)), link)))
     biases = np.linalg.inv(_LINK_M**2 * np.eye(count) + _COMMON_M**2)
-    held: Any = sparse.block_diag([bend.T @ bend] * 3 + [biases]) + 1e-9 * sparse.eye(3 * m + count)
+    held: Any = scipy.sparse.block_diag([bend.T @ bend] * 3 + [biases]) + 1e-9 * scipy.sparse.eye(
+        3 * m + count
+    )
     losses = [LATE]
     if isinstance(start, scipy.interpolate.BSpline):
         first = start.c  # pyright: ignore[reportAttributeAccessIssue]
@@ -98,9 +102,9 @@ def range_track(
             share = loss_of(error[:, None, None] ** 2, loss, error[:, None, None] > 0)[1]
             weight = share[:, 0, 0] / std
             columns = [basis.multiply(a[:, None]) for a in (away / distance[:, None]).T]
-            A: Any = sparse.hstack([*columns, of_link]).tocsr()
+            A: Any = scipy.sparse.hstack([*columns, of_link]).tocsr()
             H = A.T @ A.multiply((weight / std)[:, None]) + held
-            step = spsolve(H.tocsc(), A.T @ (weight * error) - held @ x)
+            step = scipy.sparse.linalg.spsolve(H.tocsc(), A.T @ (weight * error) - held @ x)
             x = x + step
             if np.abs(step).max() < _CONVERGED_M:
                 break

@@ -16,8 +16,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym.checks import (
@@ -77,7 +76,7 @@ def ring_least_squares(y: ArrayLike) -> FloatArray:
     return y - proj(y.sum(axis=-1, keepdims=True)) / y.shape[-1]
 
 
-def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
+def eigenvalues(C: scipy.sparse.csr_matrix) -> tuple[float, float]:
     """Return the smallest nonzero and the largest eigenvalue of ``F = C C^T``; 1, 1 without cycles.
 
     ValueError if there are more than 1500 dependent cycles over more than 1500 edges.
@@ -91,9 +90,9 @@ def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
         values = values[values > _ZERO * values[-1]]
         return float(values[0]), float(values[-1])
     F, start = (C @ C.T).tocsc(), np.ones(C.shape[0])
-    high = sp.linalg.eigsh(F, k=1, v0=start, return_eigenvectors=False)
+    high = scipy.sparse.linalg.eigsh(F, k=1, v0=start, return_eigenvectors=False)
     # The shift keeps the matrix definite.
-    low = sp.linalg.eigsh(F, k=1, sigma=-1e-6, v0=start, return_eigenvectors=False)
+    low = scipy.sparse.linalg.eigsh(F, k=1, sigma=-1e-6, v0=start, return_eigenvectors=False)
     if low[0] <= _ZERO * high[0]:
         raise ValueError(
             f"at most {_DENSE} cycles may be linearly dependent, got {C.shape[0]}: use "
@@ -102,15 +101,15 @@ def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
     return float(low[0]), float(high[0])
 
 
-def largest_eigenvalue(C: sp.csr_matrix) -> float:
+def largest_eigenvalue(C: scipy.sparse.csr_matrix) -> float:
     """Return the largest eigenvalue of ``C C^T``."""
     if min(C.shape) <= max(_DENSE, 2):
         return eigenvalues(C)[1]
     start = np.ones(C.shape[0])
-    return float(sp.linalg.eigsh(C @ C.T, k=1, v0=start, return_eigenvectors=False)[0])
+    return float(scipy.sparse.linalg.eigsh(C @ C.T, k=1, v0=start, return_eigenvectors=False)[0])
 
 
-def step_size(C: sp.csr_matrix, rule: str = "theorem") -> float:
+def step_size(C: scipy.sparse.csr_matrix, rule: str = "theorem") -> float:
     """Return the step kappa of the cycle iteration by a rule; every rule converges.
 
     Parameters
@@ -134,7 +133,7 @@ def step_size(C: sp.csr_matrix, rule: str = "theorem") -> float:
     return 2.0 / (1.0 + float(C.nnz if rule == "trace" else abs(C @ C.T).sum(axis=1).max()))
 
 
-def convergence_factor(C: sp.csr_matrix, kappa: float) -> float:
+def convergence_factor(C: scipy.sparse.csr_matrix, kappa: float) -> float:
     """Return the error factor of a step: ``max |1 - kappa lambda_i|``, lambda_i nonzero of F."""
     low, high = eigenvalues(C)
     return max(abs(1 - kappa * low), abs(1 - kappa * high))
@@ -150,7 +149,9 @@ def printed_factor(kappa: float) -> float:
     return (1 - kappa) ** 2
 
 
-def cycle_projection(C: sp.csr_matrix, y: ArrayLike, branch: ArrayLike | None = None) -> FloatArray:
+def cycle_projection(
+    C: scipy.sparse.csr_matrix, y: ArrayLike, branch: ArrayLike | None = None
+) -> FloatArray:
     """Return least-squares edge angles (..., m) with ``C psi = 2 pi k`` exactly; (11) on a branch.
 
     Parameters
@@ -166,7 +167,7 @@ def cycle_projection(C: sp.csr_matrix, y: ArrayLike, branch: ArrayLike | None = 
         If a shape is wrong, a branch is not an integer, or branches of dependent cycles are
         contradictory, so that no psi satisfies all of them.
     """
-    C = sp.csr_matrix(C)
+    C = scipy.sparse.csr_matrix(C)
     y = check_array("y", y, (C.shape[1],)) if C.shape[1] else np.zeros(0)
     if C.shape[0] == 0:
         return y.copy()
@@ -180,18 +181,18 @@ def cycle_projection(C: sp.csr_matrix, y: ArrayLike, branch: ArrayLike | None = 
     return y - shift
 
 
-def _times(C: sp.csr_matrix, x: FloatArray) -> FloatArray:
+def _times(C: scipy.sparse.csr_matrix, x: FloatArray) -> FloatArray:
     """Return ``C x`` (..., q) of vectors (..., m)."""
     return (C @ x.reshape(-1, C.shape[1]).T).T.reshape(*x.shape[:-1], C.shape[0])
 
 
-def _least_norm(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
+def _least_norm(C: scipy.sparse.csr_matrix, off: FloatArray) -> FloatArray:
     """Return the least-norm x (..., m) of ``C x = off``, in the least-squares sense."""
     right = off.reshape(-1, C.shape[0]).T
     return _least_norm_columns(C, right).T.reshape(*off.shape[:-1], C.shape[1])
 
 
-def _least_norm_columns(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
+def _least_norm_columns(C: scipy.sparse.csr_matrix, off: FloatArray) -> FloatArray:
     if C.shape[0] < C.shape[1]:
         try:
             factors = scipy.sparse.linalg.splu((C @ C.T).tocsc())
@@ -209,7 +210,7 @@ def _least_norm_columns(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
     return np.linalg.lstsq(C.toarray(), off, rcond=_ZERO)[0]
 
 
-def _solves(C: sp.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
+def _solves(C: scipy.sparse.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
     """Return whether ``C x = off`` up to rounding; without a solution the error is large."""
     return bool((np.abs(_times(C, x) - off) < 1e-6 * max(1.0, np.abs(off).max(initial=0.0))).all())
 
@@ -226,7 +227,7 @@ def cycle_consensus(
     edges: ArrayLike,
     y: ArrayLike,
     n_nodes: int,
-    cycles: str | sp.csr_matrix = "bfs",
+    cycles: str | scipy.sparse.csr_matrix = "bfs",
     kappa: float | str | None = None,
     **options: object,
 ) -> FloatArray:
@@ -253,7 +254,7 @@ def cycle_iteration(
     edges: ArrayLike,
     y: ArrayLike,
     n_nodes: int,
-    cycles: str | sp.csr_matrix = "bfs",
+    cycles: str | scipy.sparse.csr_matrix = "bfs",
     kappa: float | str | None = None,
     *,
     tol: float = 1e-12,
@@ -352,12 +353,12 @@ def cycle_iteration(
     )
 
 
-def _consistent(C: sp.csr_matrix, branch: NDArray[Any]) -> bool:
+def _consistent(C: scipy.sparse.csr_matrix, branch: NDArray[Any]) -> bool:
     """Return whether ``C psi = 2 pi k`` has a solution psi."""
     return _solves(C, _least_norm(C, branch.astype(float)), branch.astype(float))
 
 
-def _step(C: sp.csr_matrix, kappa: float | str | None, one_by_one: bool) -> float | None:
+def _step(C: scipy.sparse.csr_matrix, kappa: float | str | None, one_by_one: bool) -> float | None:
     """Return the step, checked against the exact condition; None: one over the cycle's length."""
     if one_by_one and kappa is None:
         return None
@@ -386,7 +387,7 @@ def _around(sums: FloatArray, target: FloatArray | None) -> FloatArray:
 
 
 def _one_by_one(
-    C: sp.csr_matrix,
+    C: scipy.sparse.csr_matrix,
     psi: FloatArray,
     gain: FloatArray,
     target: FloatArray | None,

@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg
+import scipy
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_number
@@ -154,11 +153,11 @@ def _linear_start(measured: _Measured, theta: FloatArray) -> FloatArray:
     ranged = measured.ranges > 0
     positions, weight = np.zeros((len(theta), 2)), np.ones(len(edges))
     for _ in range(_REWEIGHTINGS):
-        flat = across.T @ sp.diags(weight) @ across
+        flat = across.T @ scipy.sparse.diags(weight) @ across
         if ranged.any():
             rows = along[ranged]
             solved = scipy.sparse.linalg.spsolve(
-                sp.csc_matrix(flat + rows.T @ rows), rows.T @ measured.ranges[ranged]
+                scipy.sparse.csc_matrix(flat + rows.T @ rows), rows.T @ measured.ranges[ranged]
             )
         else:
             solved = _of_scale_one(flat, np.asarray(along.mean(axis=0)).ravel())
@@ -168,10 +167,10 @@ def _linear_start(measured: _Measured, theta: FloatArray) -> FloatArray:
     return _scaled(measured, positions)
 
 
-def _of_scale_one(flat: sp.spmatrix, mean_length: FloatArray) -> FloatArray:
+def _of_scale_one(flat: scipy.sparse.spmatrix, mean_length: FloatArray) -> FloatArray:
     """Minimise the quadratic form with mean length 1 along the edges."""
-    row = sp.csr_matrix(mean_length)
-    bordered = sp.bmat([[flat, row.T], [row, None]], format="csc")
+    row = scipy.sparse.csr_matrix(mean_length)
+    bordered = scipy.sparse.bmat([[flat, row.T], [row, None]], format="csc")
     right = np.zeros(len(mean_length) + 1)
     right[-1] = 1.0
     return scipy.sparse.linalg.spsolve(bordered, right)[:-1]
@@ -184,7 +183,7 @@ def _scaled(measured: _Measured, positions: FloatArray) -> FloatArray:
     return positions * (measured.length / np.linalg.norm(positions[j] - positions[i]))
 
 
-def _differences(edges: IntArray, vectors: FloatArray, n_nodes: int) -> sp.csr_matrix:
+def _differences(edges: IntArray, vectors: FloatArray, n_nodes: int) -> scipy.sparse.csr_matrix:
     """Return rows (m, 2 n - 2) of ``v' (p_j - p_i)`` for each edge's vector v, node 0 at origin."""
     columns = (2 * edges[:, :, None] + [0, 1]).reshape(-1, 4)
     values = np.concatenate([-vectors, vectors], axis=1)
@@ -203,9 +202,9 @@ def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> Fra
     J = _jacobian(measured, positions)[:, free]
     for _ in range(_MAX_STEPS):
         information = J.T @ J
-        damped = information + sp.diags(damping * information.diagonal())
+        damped = information + scipy.sparse.diags(damping * information.diagonal())
         step = np.zeros(3 * n_nodes)
-        step[free] = scipy.sparse.linalg.spsolve(sp.csc_matrix(damped), J.T @ residual)
+        step[free] = scipy.sparse.linalg.spsolve(scipy.sparse.csc_matrix(damped), J.T @ residual)
         new = theta + step[:n_nodes], positions + step[n_nodes:].reshape(-1, 2)
         size = max(
             np.abs(step[:n_nodes]).max(), np.abs(step[n_nodes:]).max() / np.abs(positions).max()
@@ -235,9 +234,9 @@ def _residuals(measured: _Measured, theta: FloatArray, positions: FloatArray) ->
     return np.concatenate([angles.ravel(), lengths])
 
 
-def _jacobian(measured: _Measured, positions: FloatArray) -> sp.csr_matrix:
+def _jacobian(measured: _Measured, positions: FloatArray) -> scipy.sparse.csr_matrix:
     """Return the derivative of the whitened predictions."""
     ranged = measured.edges[measured.ranges > 0]
     rows: list[Any] = [bearing_jacobian(positions, measured.edges) / measured.bearing_std]
     rows.append(range_jacobian(positions, ranged) / measured.range_std)
-    return sp.csr_matrix(sp.vstack(rows))
+    return scipy.sparse.csr_matrix(scipy.sparse.vstack(rows))

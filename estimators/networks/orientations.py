@@ -12,8 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg
+import scipy
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_one_of
@@ -272,7 +271,7 @@ def chordal_optimum(
 
 def _dual(
     edges: IntArray, residual: FloatArray, n_nodes: int, weights: FloatArray | None = None
-) -> sp.csc_matrix:
+) -> scipy.sparse.csc_matrix:
     """Return the dual matrix in the gauge of the solution, in which its null vector is 1.
 
     Rows and columns are divided by the roots of the nodes' sums of weights. This keeps
@@ -281,11 +280,11 @@ def _dual(
     weights = check_weights(weights, edges)
     L = _laplacian(edges, weights * np.exp(-1j * residual), n_nodes)
     fitted = np.bincount(edges.ravel(), np.repeat(weights * np.cos(residual), 2), n_nodes)
-    scale = sp.diags(1 / np.sqrt(L.diagonal().real))
-    return sp.csc_matrix(scale @ (L + sp.diags(fitted - L.diagonal())) @ scale)
+    scale = scipy.sparse.diags(1 / np.sqrt(L.diagonal().real))
+    return scipy.sparse.csc_matrix(scale @ (L + scipy.sparse.diags(fitted - L.diagonal())) @ scale)
 
 
-def _is_positive(S: sp.csc_matrix) -> bool:
+def _is_positive(S: scipy.sparse.csc_matrix) -> bool:
     """Return whether a Hermitian matrix has only positive pivots, in symmetric elimination."""
     try:
         factors = _factorised(S)
@@ -296,7 +295,7 @@ def _is_positive(S: sp.csc_matrix) -> bool:
     return bool(in_order and (pivots > _PIVOT_FLOOR).all())
 
 
-def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matrix:
+def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> scipy.sparse.csc_matrix:
     """Return the Laplacian of complex links.
 
     It is the Hermitian matrix with ``-links`` at (i, j), their conjugates at (j, i), and the sums
@@ -308,13 +307,16 @@ def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matri
     degree = np.bincount(edges.ravel(), np.repeat(np.abs(links), 2), n_nodes)
     values = np.concatenate([-links, -np.conj(links), degree])
     rows, columns = np.concatenate([i, j, nodes]), np.concatenate([j, i, nodes])
-    return sp.csc_matrix((values, (rows, columns)), shape=(n_nodes, n_nodes))
+    return scipy.sparse.csc_matrix((values, (rows, columns)), shape=(n_nodes, n_nodes))
 
 
-def _factorised(A: sp.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
+def _factorised(A: scipy.sparse.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
     """Factorise a Hermitian matrix with diagonal pivots, in minimum-degree or natural order."""
     return scipy.sparse.linalg.splu(
-        sp.csc_matrix(A), permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        scipy.sparse.csc_matrix(A),
+        permc_spec=order,
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
     )
 
 

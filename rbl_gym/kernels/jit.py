@@ -132,6 +132,34 @@ def _in_haste() -> Iterator[None]:
             gc.enable()
 
 
+@contextlib.contextmanager
+def _loading_alone() -> Iterator[None]:
+    """Context in which numba loads what is stored without first loading its means to compile.
+
+    These take a quarter of a second. numba loads them anyway before it compiles.
+    """
+    try:
+        from numba.core.caching import Cache
+        from numba.core.runtime import rtsys
+    except ImportError:  # private names of numba
+        yield
+        return
+    find: Any = Cache.load_overload
+
+    def load_overload(self: Any, signature: Any, target: Any) -> Any:
+        target.refresh = lambda: rtsys.initialize(target)
+        try:
+            return find(self, signature, target)
+        finally:
+            del target.refresh  # deletes the attribute of the instance
+
+    Cache.load_overload = load_overload
+    try:
+        yield
+    finally:
+        Cache.load_overload = find
+
+
 def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any, ...]) -> Any:
     """Return a generalized ufunc of a function.
 
@@ -192,7 +220,7 @@ def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
                 rank = rank if place < inputs else max(rank, 1)
                 kind = _TYPES[letter]
                 arguments.append(kind[(slice(None),) * rank] if rank else kind)
-            with _alone(), _in_haste(), types_remembered():
+            with _alone(), _in_haste(), types_remembered(), _loading_alone():
                 made = _compile(function, signature, tuple(arguments))
             # The wrapper of numba around NumPy's ufunc takes a microsecond per call.
             return getattr(made, "ufunc", made)

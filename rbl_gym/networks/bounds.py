@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
+import scipy
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
@@ -169,7 +169,7 @@ def _outer(vectors: FloatArray) -> FloatArray:
     return vectors[..., :, None] * vectors[..., None, :]
 
 
-def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
+def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> scipy.sparse.csr_matrix:
     """Return the derivative (2 m, 3 n) of bearings by n orientations, then x and y of each node.
 
     Rows are in the order of ``bearings.ravel()``: of j seen by i, of i seen by j, edge by edge.
@@ -194,7 +194,7 @@ def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
     return sparse_rows(values, columns, 3 * n_nodes)
 
 
-def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
+def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> scipy.sparse.csr_matrix:
     """Return derivative (k, 3 n) of distances of node pairs, columns as in `bearing_jacobian`."""
     positions = check_positions(positions)
     n_nodes = len(positions)
@@ -205,10 +205,10 @@ def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
     return sparse_rows(np.concatenate([-along, along], axis=1), columns, 3 * n_nodes)
 
 
-def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
+def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> scipy.sparse.csr_matrix:
     """Return the sparse matrix (m, width) of entries (m, k) at columns (m, k)."""
     rows, each = values.shape
-    return sp.csr_matrix(
+    return scipy.sparse.csr_matrix(
         (values.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(rows, width)
     )
 
@@ -263,7 +263,7 @@ def frame_covariance(
             "either known_pair or ranges must be given, as one of them sets the scale; got neither"
         )
     free = free_columns(len(positions))
-    J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
+    J = scipy.sparse.csr_matrix(scipy.sparse.vstack(rows))[:, free].toarray()
     if known_pair is not None:
         # Motions that keep the known distance: the null space of its one row.
         pair = check_pair("known_pair", known_pair, len(positions))

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
+import scipy
 from numpy.typing import ArrayLike
-from scipy.sparse import csgraph
 
 from rbl_gym.checks import check_one_of
 from rbl_gym.networks.edges import IntArray, check_edges
@@ -37,7 +36,7 @@ class SpanningTree(NamedTuple):
 
 def components(edges: ArrayLike, n_nodes: int) -> IntArray:
     """Return the label (n,) of the connected component of every node."""
-    return csgraph.connected_components(
+    return scipy.sparse.csgraph.connected_components(
         _adjacency(check_edges(edges, n_nodes), n_nodes), directed=False
     )[1].astype(np.intp)
 
@@ -70,17 +69,19 @@ def _name(nodes: np.ndarray) -> str:
     return "{" + listed + (f", ... {len(nodes)} nodes" if len(nodes) > _NAMED else "") + "}"
 
 
-def _adjacency(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+def _adjacency(edges: IntArray, n_nodes: int) -> scipy.sparse.csr_matrix:
     ones = np.ones(len(edges), dtype=np.int8)
-    return sp.csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(n_nodes, n_nodes))
+    return scipy.sparse.csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(n_nodes, n_nodes))
 
 
-def incidence(edges: ArrayLike, n_nodes: int) -> sp.csr_matrix:
+def incidence(edges: ArrayLike, n_nodes: int) -> scipy.sparse.csr_matrix:
     """Return the incidence matrix B (m, n): ``B theta`` are ``theta_j - theta_i``."""
     edges = check_edges(edges, n_nodes)
     m = len(edges)
     values = np.tile([-1.0, 1.0], m)
-    return sp.csr_matrix((values, edges.ravel(), 2 * np.arange(m + 1)), shape=(m, n_nodes))
+    return scipy.sparse.csr_matrix(
+        (values, edges.ravel(), 2 * np.arange(m + 1)), shape=(m, n_nodes)
+    )
 
 
 def spanning_tree(edges: ArrayLike, n_nodes: int) -> SpanningTree:
@@ -95,15 +96,15 @@ def spanning_tree(edges: ArrayLike, n_nodes: int) -> SpanningTree:
     return _tree(edges, _breadth_first(_neighbours(edges, n_nodes), 0))
 
 
-def _neighbours(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+def _neighbours(edges: IntArray, n_nodes: int) -> scipy.sparse.csr_matrix:
     graph = _adjacency(edges, n_nodes)
-    both = sp.csr_matrix(graph + graph.T)
+    both = scipy.sparse.csr_matrix(graph + graph.T)
     both.sort_indices()
     return both
 
 
-def _breadth_first(graph: sp.csr_matrix, root: int) -> IntArray:
-    parent = csgraph.breadth_first_order(graph, root)[1].astype(np.intp)
+def _breadth_first(graph: scipy.sparse.csr_matrix, root: int) -> IntArray:
+    parent = scipy.sparse.csgraph.breadth_first_order(graph, root)[1].astype(np.intp)
     parent[root] = root
     return parent
 
@@ -138,7 +139,7 @@ def _tree_edges(edges: IntArray, parent: IntArray) -> tuple[IntArray, IntArray]:
     return edge, sign
 
 
-def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_matrix:
+def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> scipy.sparse.csr_matrix:
     """Return the cycle matrix C (q, m), entries -1, 0, 1: ``C B = 0`` (Definition 4).
 
     Parameters
@@ -165,13 +166,15 @@ def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_m
     return _OTHERS[basis](edges, n_nodes)
 
 
-def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+def check_cycles(
+    cycles: ArrayLike | scipy.sparse.csr_matrix, edges: IntArray, n_nodes: int
+) -> scipy.sparse.csr_matrix:
     """Return a checked user-defined cycle matrix (q, m); its rows may be linearly dependent.
 
     ValueError if it has another number of columns, or a row is not a closed walk that uses each
     edge once.
     """
-    C = sp.csr_matrix(cycles, dtype=np.float64, copy=True)
+    C = scipy.sparse.csr_matrix(cycles, dtype=np.float64, copy=True)
     if C.shape[1] != len(edges):
         raise ValueError(
             f"cycles must have {len(edges)} columns, one for each edge, got shape {C.shape}"
@@ -187,7 +190,7 @@ def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: in
     return C
 
 
-def fundamental_cycles(edges: IntArray, tree: SpanningTree) -> sp.csr_matrix:
+def fundamental_cycles(edges: IntArray, tree: SpanningTree) -> scipy.sparse.csr_matrix:
     """Return one cycle for each edge outside a tree: i to j, and back along the tree."""
     outside = np.ones(len(edges), dtype=np.bool_)
     outside[tree.edge[1:]] = False
@@ -207,12 +210,14 @@ def fundamental_cycles(edges: IntArray, tree: SpanningTree) -> sp.csr_matrix:
         cycle, ends = cycle[open_], ends[:, open_]
     entries = np.concatenate(values).astype(np.float64)
     shape = (len(closing), len(edges))
-    C = sp.csr_matrix((entries, (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    C = scipy.sparse.csr_matrix(
+        (entries, (np.concatenate(rows), np.concatenate(columns))), shape=shape
+    )
     C.sort_indices()
     return C
 
 
-def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+def _paton_basis(edges: IntArray, n_nodes: int) -> scipy.sparse.csr_matrix:
     """Return cycles of Paton (1969): every edge that meets a node already reached closes one."""
     near: list[list[tuple[int, int]]] = [[] for _ in range(n_nodes)]
     for row, (i, j) in enumerate(edges.tolist()):
@@ -243,17 +248,17 @@ def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
     return _walked(walks, edges)
 
 
-def _walked(walks: list[list[tuple[int, int]]], edges: IntArray) -> sp.csr_matrix:
+def _walked(walks: list[list[tuple[int, int]]], edges: IntArray) -> scipy.sparse.csr_matrix:
     """Return the cycle matrix of closed walks, lists of (node, row of the edge that leaves it)."""
     rows = [row for row, walk in enumerate(walks) for _ in walk]
     starts, columns = (
         np.array([step[k] for walk in walks for step in walk], dtype=np.intp) for k in (0, 1)
     )
     signs = np.where(edges[columns, 0] == starts, 1.0, -1.0)
-    return sp.csr_matrix((signs, (rows, columns)), shape=(len(walks), len(edges)))
+    return scipy.sparse.csr_matrix((signs, (rows, columns)), shape=(len(walks), len(edges)))
 
 
-def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+def _all_cycles(edges: IntArray, n_nodes: int) -> scipy.sparse.csr_matrix:
     """Return every cycle from its smallest node, in the direction that leaves by the smaller row.
 
     A path is extended only if it can still return to its start, so that every branch has a cycle.
@@ -306,7 +311,7 @@ def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
     return _walked(walks, edges)
 
 
-def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+def _minimum_basis(edges: IntArray, n_nodes: int) -> scipy.sparse.csr_matrix:
     """Return Horton's basis: the shortest independent cycles of two shortest paths and an edge."""
     wanted = len(edges) - n_nodes + 1
     graph = _neighbours(edges, n_nodes)
@@ -323,7 +328,7 @@ def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
         through = tree.depth[named[outside]].sum(axis=1) + 1 == lengths
         candidates += [(int(lengths[row]), root, row, C[row]) for row in np.flatnonzero(through)]
     candidates.sort(key=lambda candidate: candidate[:3])
-    chosen: list[sp.csr_matrix] = []
+    chosen: list[scipy.sparse.csr_matrix] = []
     # Cycles as bits of an int; independent modulo 2 implies independent.
     pivots: dict[int, int] = {}
     for *_, cycle in candidates:
@@ -335,7 +340,11 @@ def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
         if bits:
             pivots[bits.bit_length()] = bits
             chosen.append(cycle)
-    return sp.csr_matrix(sp.vstack(chosen)) if chosen else sp.csr_matrix((0, len(edges)))
+    return (
+        scipy.sparse.csr_matrix(scipy.sparse.vstack(chosen))
+        if chosen
+        else scipy.sparse.csr_matrix((0, len(edges)))
+    )
 
 
 _OTHERS = {"paton": _paton_basis, "minimum": _minimum_basis, "all": _all_cycles}

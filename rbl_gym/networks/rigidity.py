@@ -12,8 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg
+import scipy
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array
@@ -51,7 +50,7 @@ class Localizability(NamedTuple):
         return self.orientations and self.rank == self.full_rank
 
 
-def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
+def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> scipy.sparse.csr_matrix:
     """Return the rows (m, 2 n) whose null space are node shifts that keep all edge directions.
 
     This holds to first order. The row of edge (i, j) is ``u' (dp_j - dp_i)``, with u' the unit
@@ -104,9 +103,9 @@ def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> No
     ValueError
         If they do not at these positions; the message names the missing rank.
     """
-    J = sp.vstack([bearing_jacobian(positions, edges), range_jacobian(positions, ranged)])
+    J = scipy.sparse.vstack([bearing_jacobian(positions, edges), range_jacobian(positions, ranged)])
     full = J.shape[1] - 3
-    missing = _null_dimension(sp.csr_matrix(J)) - 3
+    missing = _null_dimension(scipy.sparse.csr_matrix(J)) - 3
     if missing:
         raise ValueError(
             f"edges and ranges must determine all frames (rank {full}), got rank {full - missing}: "
@@ -114,9 +113,9 @@ def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> No
         )
 
 
-def _null_dimension(R: sp.csr_matrix) -> int:
+def _null_dimension(R: scipy.sparse.csr_matrix) -> int:
     """Return the dimension of the null space, from the zero eigenvalues of ``R^T R``."""
-    gram = sp.csc_matrix(R.T @ R)
+    gram = scipy.sparse.csc_matrix(R.T @ R)
     size = gram.shape[0]
     if size <= _DENSE:
         return int((np.linalg.eigvalsh(gram.toarray()) < _ZERO).sum())
