@@ -36,8 +36,8 @@ def move(
 ) -> None:  # fmt: skip
     """Predict pose, twist and biases: ``F P F^T + G Q G^T`` with decaying biases."""
     turn, J, both = workspace((3, 3)), workspace((3, 3)), workspace((3, 3))
-    kept = np.empty(max(1, laws.shape[0]))
     size = P0.shape[0]
+    kept = np.empty(size)
     unknown = n_twist > 0
     reach = dt**3 / 3 if unknown else 0.0
     x, y, z = twist[0] * dt, twist[1] * dt, twist[2] * dt
@@ -50,23 +50,26 @@ def move(
         t[i] = t0[i] + dt * (extra0[3 + i] if unknown else twist[3 + i])
     first = 6 + n_twist
     links = (size - first) // laws.shape[0] if laws.shape[0] > 0 else 1
+    for i in range(first):
+        kept[i] = 1.0
     for a in range(laws.shape[0]):
-        kept[a] = math.exp(-dt / laws[a, 1])
+        decay = math.exp(-dt / laws[a, 1])
+        for i in range(first + a * links, first + (a + 1) * links):
+            kept[i] = decay
     # Rows of P, then columns: F acts on those of the pose, the decay on those of the biases.
-    for i in range(size):
-        decay = 1.0 if i < first else kept[(i - first) // links]
+    for j in range(size):
+        for i in range(3):
+            value = turn[i, 0] * P0[0, j] + turn[i, 1] * P0[1, j] + turn[i, 2] * P0[2, j]
+            if unknown:
+                value += dt * (J[i, 0] * P0[6, j] + J[i, 1] * P0[7, j] + J[i, 2] * P0[8, j])
+            P[i, j] = value * kept[j]
+            value = P0[3 + i, j]
+            if unknown:
+                value += dt * P0[9 + i, j]
+            P[3 + i, j] = value * kept[j]
+    for i in range(6, size):
         for j in range(size):
-            if i < 3:
-                value = turn[i, 0] * P0[0, j] + turn[i, 1] * P0[1, j] + turn[i, 2] * P0[2, j]
-                if unknown:
-                    value += dt * (J[i, 0] * P0[6, j] + J[i, 1] * P0[7, j] + J[i, 2] * P0[8, j])
-            elif i < 6:
-                value = P0[i, j]
-                if unknown:
-                    value += dt * P0[i + 6, j]
-            else:
-                value = decay * P0[i, j]
-            P[i, j] = value
+            P[i, j] = kept[i] * P0[i, j] * kept[j]
     for i in range(size):
         a0, a1, a2 = P[i, 0], P[i, 1], P[i, 2]
         for j in range(3):
@@ -75,8 +78,6 @@ def move(
                 value += dt * (J[j, 0] * P[i, 6] + J[j, 1] * P[i, 7] + J[j, 2] * P[i, 8])
                 P[i, 3 + j] += dt * P[i, 9 + j]
             P[i, j] = value
-        for j in range(first, size):
-            P[i, j] *= kept[(j - first) // links]
     # With acceleration noise q, the velocity change has variance q dt, the displacement q dt^3 / 3,
     # and their covariance is q dt^2 / 2.
     for i in range(3):
@@ -100,9 +101,10 @@ def move(
         extra[i] = extra0[i]
     for a in range(laws.shape[0]):
         begin = first + a * links
-        fresh = 1 - kept[a] * kept[a]
+        decay = math.exp(-dt / laws[a, 1])
+        fresh = 1 - decay * decay
         for i in range(links):
-            extra[begin - 6 + i] = kept[a] * extra0[begin - 6 + i]
+            extra[begin - 6 + i] = decay * extra0[begin - 6 + i]
             if fresh > 0:
                 for j in range(links):
                     P[begin + i, begin + j] += fresh * laws[a, 2] * laws[a, 2]
@@ -135,11 +137,12 @@ def revise(
     small = workspace((3, 3, 3))
     D, turn, new_Q = small[0], small[1], small[2]
     new_t = workspace((3,))
-    rows = np.empty((4, count, 6))
+    padded = (count + 3) // 4 * 4
+    rows = np.zeros((4, padded, 6))
     of_pose, slope, H, B = rows[0], rows[1], rows[2], rows[3]
     own, L = np.empty((count, count)), np.empty((count, count))
-    values = np.empty((5, count))
-    told, variance, share, nu, y = values[0], values[1], values[2], values[3], values[4]
+    values, y = np.empty((4, count)), np.zeros(padded)
+    told, variance, share, nu = values[0], values[1], values[2], values[3]
     for i in range(6):
         for j in range(6):
             A[i, j] = P0[i, j]
@@ -173,8 +176,8 @@ def revise(
             own[k, m] = own[m, k] = total
     copy_pose(start_Q, start_t, Q, t)
     robust = loss[0] < math.inf
+    innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
     for again in range(2):
-        innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
         if again:
             fill(0.0, at_start)
         if robust:
@@ -185,13 +188,15 @@ def revise(
             break
         sound = weigh(own, variance, share, L) and sound
         # Damped Gauss-Newton as in `pose_solver.solve`.
-        cost, decrease, damping = 0.0, 0.0, 0.0
+        cost, decrease, damping, accepted = 0.0, 0.0, 0.0, True
         copy_pose(Q, t, new_Q, new_t)
         for k in range(iterations + 1):
-            innovation(new_Q, new_t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
+            if k > 0:
+                innovation(new_Q, new_t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
             whiten(L, nu, H, y, B)
             new = linearize(e, D, y, B, information, new_g, A)
-            if k == 0 or new <= cost * (1 + 1e-12) or decrease < 1e-8:
+            accepted = k == 0 or new <= cost * (1 + 1e-12) or decrease < 1e-8
+            if accepted:
                 cost = new
                 damping = 0.1 * damping if damping > 1e-5 else 0.0
                 copy_pose(new_Q, new_t, Q, t)
@@ -218,8 +223,9 @@ def revise(
             rotations.compose(turn, Q, new_Q)
             for i in range(3):
                 new_t[i] = t[i] + step[3 + i]
-    innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
-    whiten(L, nu, H, y, B)
+        if not accepted:
+            innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
+            whiten(L, nu, H, y, B)
     mirror(best)
     keep_wide(Q0, information, Q, weights, tags, best)
     sound = cholesky6(best, L6) and sound
@@ -227,54 +233,76 @@ def revise(
     if not sound:
         fill(math.nan, pose)
     # Of the extra states: information of the ranges given the pose, then that of the pose. The
-    # innermost loops run over columns of one row, which the compiler makes vector operations.
+    # innermost loops run over columns of one row, which the compiler makes vector operations, and
+    # take four rows at a time, so that they seldom write.
     K = size - 6
-    narrow = np.empty((4, 6, K))
+    narrow = np.zeros((4, 6, K))
     with_pose, by_pose, moved, new = narrow[0], narrow[1], narrow[2], narrow[3]
-    told_by, line = np.empty((count, K)), np.empty(K)
-    for i in range(K):
-        for j in range(6):
+    told_by, line = np.zeros((padded, K)), np.zeros(K)
+    for j in range(6):
+        for i in range(K):
             with_pose[j, i] = P0[6 + i, j]
-        for j in range(6):
-            total = 0.0
-            for m in range(6):
-                total += with_pose[m, i] * information[m, j]
-            by_pose[j, i] = total
-        for k in range(count):
-            total = 0.0
-            for b in range(n_laws):
-                total += P0[6 + i, first + b * n_links + chosen[k]]
-            for j in range(6):
-                total -= by_pose[j, i] * of_pose[k, j]
-            told_by[k, i] = total
+    for j in range(6):
+        for m in range(6):
+            factor = information[m, j]
+            for i in range(K):
+                by_pose[j, i] += with_pose[m, i] * factor
     for k in range(count):
-        for m in range(k):
+        for b in range(n_laws):
+            for i in range(K):
+                told_by[k, i] += P0[6 + i, first + b * n_links + chosen[k]]
+        for j in range(6):
+            factor = of_pose[k, j]
+            for i in range(K):
+                told_by[k, i] -= by_pose[j, i] * factor
+    for k in range(count):
+        for m in range(0, k - 3, 4):
+            a, b, c, d = L[k, m], L[k, m + 1], L[k, m + 2], L[k, m + 3]
+            for i in range(K):
+                told_by[k, i] -= (
+                    a * told_by[m, i] + b * told_by[m + 1, i]
+                    + c * told_by[m + 2, i] + d * told_by[m + 3, i]
+                )  # fmt: skip
+        for m in range(k - k % 4, k):
             factor = L[k, m]
             for i in range(K):
                 told_by[k, i] -= factor * told_by[m, i]
         for i in range(K):
             told_by[k, i] *= L[k, k]
     for i in range(K):
-        value = extra0[i]
+        line[i] = extra0[i]
+    for j in range(6):
+        for i in range(K):
+            line[i] += by_pose[j, i] * e[j]
+        for m in range(6):
+            factor = (D[m, j] if m < 3 else 0.0) if j < 3 else (1.0 if m == j else 0.0)
+            if factor != 0.0:
+                for i in range(K):
+                    moved[j, i] += by_pose[m, i] * factor
+    for k in range(0, count, 4):
+        a, b, c, d = y[k], y[k + 1], y[k + 2], y[k + 3]
+        for i in range(K):
+            line[i] += (
+                a * told_by[k, i] + b * told_by[k + 1, i]
+                + c * told_by[k + 2, i] + d * told_by[k + 3, i]
+            )  # fmt: skip
         for j in range(6):
-            value += by_pose[j, i] * e[j]
-        for k in range(count):
-            value += told_by[k, i] * y[k]
-        extra[i] = value
-        for j in range(6):
-            total = by_pose[j, i]
-            if j < 3:
-                total = by_pose[0, i] * D[0, j] + by_pose[1, i] * D[1, j] + by_pose[2, i] * D[2, j]
-            for k in range(count):
-                total -= told_by[k, i] * B[k, j]
-            moved[j, i] = total
-        for j in range(6):
-            total = 0.0
-            for m in range(6):
-                total += moved[m, i] * pose[m, j]
-            new[j, i] = P[6 + i, j] = P[j, 6 + i] = total
-    for i in range(6):
-        for j in range(6):
+            a, b, c, d = B[k, j], B[k + 1, j], B[k + 2, j], B[k + 3, j]
+            for i in range(K):
+                moved[j, i] -= (
+                    a * told_by[k, i] + b * told_by[k + 1, i]
+                    + c * told_by[k + 2, i] + d * told_by[k + 3, i]
+                )  # fmt: skip
+    for i in range(K):
+        extra[i] = line[i]
+    for j in range(6):
+        for m in range(6):
+            factor = pose[m, j]
+            for i in range(K):
+                new[j, i] += moved[m, i] * factor
+        for i in range(K):
+            P[6 + i, j] = P[j, 6 + i] = new[j, i]
+        for i in range(6):
             P[i, j] = pose[i, j]
     for i in range(K):
         for j in range(i + 1):
@@ -284,10 +312,13 @@ def revise(
             for j in range(i + 1):
                 line[j] -= a * with_pose[m, j]
                 line[j] += b * moved[m, j]
-        for k in range(count):
-            a = told_by[k, i]
+        for k in range(0, count, 4):
+            a, b, c, d = told_by[k, i], told_by[k + 1, i], told_by[k + 2, i], told_by[k + 3, i]
             for j in range(i + 1):
-                line[j] -= a * told_by[k, j]
+                line[j] -= (
+                    a * told_by[k, j] + b * told_by[k + 1, j]
+                    + c * told_by[k + 2, j] + d * told_by[k + 3, j]
+                )  # fmt: skip
         for j in range(i + 1):
             P[6 + i, 6 + j] = P[6 + j, 6 + i] = line[j]
 

@@ -277,8 +277,7 @@ def judge(measured: Measured, table: Table, signed: bool) -> None:
         empty = np.zeros(len(range), dtype=bool)
         for c, name in enumerate(measured.columns):
             some = at[measured.column[at] == c]
-            cells = table.columns[name][measured.row[some]]
-            empty[some] = [not cell.strip() for cell in cells]
+            empty[some] = table.empty(name, measured.row[some])
         measured.drop(empty, "empty")
         measured.drop(np.isnan(range), "not a number")
     measured.drop(measured.anchor < 0, "of an unknown anchor")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym.checks import BoolArray, FloatArray, did_you_mean
+from rbl_gym.recordings.columns import Columns
 from rbl_gym.recordings.stamps import TIME_UNITS, found_unit, iso_seconds, seconds_per
 from rbl_gym.recordings.text import is_number, read_cells
 
@@ -75,7 +76,7 @@ class Table(NamedTuple):
     path: str
     header_line: int
     lines: NDArray[np.int64]
-    columns: dict[str, NDArray[np.object_]]  # by content, or else by name in the file
+    columns: Columns  # by content, or else by name in the file
     names: dict[str, str]  # in the file, in its order
     units: dict[str, str]  # given in the header
     decimal: str  # "." or ","
@@ -128,8 +129,7 @@ class Table(NamedTuple):
 
     def select(self, rows: BoolArray) -> Table:
         """Return the table with some of the rows."""
-        columns = {name: cells[rows] for name, cells in self.columns.items()}
-        return self._replace(lines=self.lines[rows], columns=columns)
+        return self._replace(lines=self.lines[rows], columns=self.columns.select(rows))
 
     def text(self, column: str) -> list[str]:
         """Return (rows,) cells without surrounding space."""
@@ -137,6 +137,20 @@ class Table(NamedTuple):
 
     def numbers(self, column: str, *, may_be_missing: bool = False) -> FloatArray:
         """Return (rows,) finite numbers; NaN for empty cells if these are allowed."""
+        values = self.columns.numbers(column)
+        if values is None:
+            values, missing = self._read_numbers(column)
+        else:
+            missing = np.isnan(values)
+        ok = np.isfinite(values)
+        if may_be_missing and not ok.all():
+            ok |= missing
+            values[~np.isfinite(values)] = np.nan
+        self.check(ok, column, "must be a finite number")
+        return values
+
+    def _read_numbers(self, column: str) -> tuple[FloatArray, BoolArray]:
+        """Return the numbers in the cells of a column, NaN for others, and which are missing."""
         cells = self.columns[column].tolist()
         if self.decimal == ",":
             cells = [cell.replace(",", ".") for cell in cells]
@@ -146,12 +160,21 @@ class Table(NamedTuple):
             values = np.array([*map(float, cells)])
         except ValueError:
             values = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
-        ok = np.isfinite(values)
-        if may_be_missing and not ok.all():
-            ok |= np.array([cell.strip().lower() in _MISSING for cell in cells])
-            values[~np.isfinite(values)] = np.nan
-        self.check(ok, column, "must be a finite number")
-        return values
+        missing = ~np.isfinite(values)
+        for row in np.flatnonzero(missing).tolist():
+            missing[row] = cells[row].strip().lower() in _MISSING
+        return values, missing
+
+    def is_numeric(self, column: str) -> bool:
+        """Return whether the first cell of a column is a number."""
+        return self.columns.numbers(column) is not None or is_number(self.columns[column][0])
+
+    def empty(self, column: str, rows: IntArray) -> BoolArray:
+        """Return which cells of some rows are empty."""
+        values = self.columns.numbers(column)
+        if values is not None:
+            return np.isnan(values[rows])
+        return np.array([not cell.strip() for cell in self.columns[column][rows]], np.bool_)
 
     def seconds(self, unit: str | None = None) -> tuple[FloatArray, str]:
         """Return (rows,) column `t` in seconds, and a note on its unit ("": none).
@@ -160,16 +183,17 @@ class Table(NamedTuple):
         """
         self.require("t")
         said = unit or self.unit("t", TIME_UNITS) or None
-        if said == "iso" or (said is None and not is_number(self.columns["t"][0])):
+        if said == "iso" or (said is None and not self.is_numeric("t")):
             stamps = iso_seconds(self.columns["t"].tolist())
             if stamps is not None and (said == "iso" or np.isfinite(stamps[0])):
                 self.check(np.isfinite(stamps), "t", "must be a time of ISO 8601")
                 return stamps, "" if said else "times are read as ISO 8601"
-        self.check(
-            np.array([":" not in cell for cell in self.columns["t"]]),
-            "t",
-            "times of day need a date, as in ISO 8601: 2024-05-01T12:00:00.5; or give seconds",
-        )
+        if self.columns.numbers("t") is None:
+            self.check(
+                np.array([":" not in cell for cell in self.columns["t"]]),
+                "t",
+                "times of day need a date, as in ISO 8601: 2024-05-01T12:00:00.5; or give seconds",
+            )
         values, note = self.numbers("t"), ""
         if said is None:
             said, note = found_unit(values)
@@ -244,7 +268,7 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
     if not (first := is_first(header)).all():
         name = header[first.argmin()]
         raise ValueError(f"{where}: two columns have the name {name!r}: rename one")
-    by_name = dict(zip(header, cells.columns, strict=True))
+    by_name = Columns({name: i for i, name in enumerate(header)}, cells.columns, cells.values)
     said = {role: _name_and_unit(name) for role, name in source.columns.items()}
     names = _roles(where, header, {role: name for role, (name, _) in said.items()}, source)
     units |= {name: unit for name, unit in said.values() if unit}
@@ -262,7 +286,9 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
         cells.path,
         cells.header_line,
         np.array(cells.lines),
-        {role: _column(by_name[name]) for role, name in names.items()},
+        Columns(
+            {role: header.index(name) for role, name in names.items()}, cells.columns, cells.values
+        ),
         names,
         {role: units[name] for role, name in names.items() if units[name]},
         cells.decimal,
@@ -282,12 +308,6 @@ def _name_and_unit(cell: str) -> tuple[str, str]:
     if unit[2]:
         return cell, unit[2]
     return cell[: unit.start()], re.sub("[\u00b5\u03bc]", "u", unit[1])
-
-
-def _column(cells: tuple[str, ...]) -> NDArray[np.object_]:
-    column = np.empty(len(cells), dtype=object)
-    column[:] = cells
-    return column
 
 
 def _roles(

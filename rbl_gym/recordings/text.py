@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import csv
+import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.recordings.columns import plain_numbers
 
 # Possible delimiters; white space only if the header has none of the others.
 _DELIMITERS = ("\t", ";", ",")
@@ -24,7 +28,8 @@ class Cells(NamedTuple):
     header_line: int
     header: list[str]
     lines: list[int]
-    columns: list[tuple[str, ...]]
+    columns: Callable[[], list[tuple[str, ...]]]
+    values: FloatArray | None  # (rows, columns), if all cells are numbers or empty (NaN)
     decimal: str  # "." or ","
     cut: int | None  # line of a last row that was cut off and left out
 
@@ -81,6 +86,16 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
                     f"{path}, line {first + 1}: must have the names of the columns, got "
                     f"{lines[first]!r:.80}"
                 )
+    header = [cell.strip() for cell in header]
+    values = plain_numbers("\n".join(lines[start + 1 :]).rstrip("\n"), len(header), comma)
+    if values is not None:
+        numbers = [*range(start + 2, start + 2 + len(values))]
+
+        @functools.cache
+        def columns() -> list[tuple[str, ...]]:
+            return [*zip(*_rows(path, lines, start, header, comma)[0], strict=True)]
+
+        return Cells(path, start + 1, header, numbers, columns, values, ".", None)
     rows, numbers, cut = _rows(path, lines, start, header, comma)
     if not rows:
         raise ValueError(f"{path}: must have rows below the header, got none")
@@ -89,8 +104,8 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
         decimal = ","
         if _DECIMAL_POINT.search(text):
             _check_decimals(path, rows, numbers)
-    columns = [*zip(*rows, strict=True)]
-    return Cells(path, start + 1, [cell.strip() for cell in header], numbers, columns, decimal, cut)
+    found = [*zip(*rows, strict=True)]
+    return Cells(path, start + 1, header, numbers, lambda: found, None, decimal, cut)
 
 
 def _rows(

@@ -14,7 +14,6 @@ from rbl_gym.geometry import rotations
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.stamps import WORDS, dated_unit, unit_by_length
 from rbl_gym.recordings.tables import AS_NAMED, AnyPath, Source, Table, read_table
-from rbl_gym.recordings.text import is_number
 
 __all__ = ["Truth", "read_truth", "truth_at"]
 
@@ -135,7 +134,7 @@ def read_truth(
         held = None if rotation is None else np.broadcast_to(rotation, (*shape, 3))
         return Truth(times, held, np.broadcast_to(translation, shape), planar, form)
     unit = table.units.get("t")
-    if unit is None and is_number(table.columns["t"][0]):
+    if unit is None and table.is_numeric("t"):
         # Poses may be rare, so their spacing does not distinguish seconds from milliseconds.
         values = table.numbers("t")
         unit = dated_unit(values)
@@ -217,7 +216,7 @@ def _known_names(table: Table) -> Table:
             like.setdefault(role, []).append(name)
     new = {names[0]: role for role, names in like.items() if len(names) == 1}
     return table._replace(
-        columns={new.get(name, name): cells for name, cells in table.columns.items()},
+        columns=table.columns.renamed(new),
         names={new.get(role, role): name for role, name in table.names.items()},
         units={new.get(role, role): unit for role, unit in table.units.items()},
     )
