@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import logging
 import os
@@ -43,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status (2: invalid input, with a message)."""
     # Commands create few cycles; by default their collection takes a tenth of the time.
     gc.set_threshold(100_000)
+    # At its end Python would look for cycles in all objects, for a quarter of a second.
+    atexit.register(gc.freeze)
     try:
         try:
             return _run(arguments)
