@@ -387,11 +387,7 @@ def _around(sums: FloatArray, target: FloatArray | None) -> FloatArray:
 
 
 def _one_by_one(
-    C: scipy.sparse.csr_matrix,
-    psi: FloatArray,
-    gain: FloatArray,
-    target: FloatArray | None,
-    turns: NDArray[np.intp],
+    C: Any, psi: FloatArray, gain: FloatArray, target: FloatArray | None, turns: NDArray[np.intp]
 ) -> None:
     """Update each cycle of `turns` in order, with the current edges."""
     for row in turns:
