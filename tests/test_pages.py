@@ -244,6 +244,19 @@ def drawn(told: Story) -> Any:
     return track_html.track_figure(told)
 
 
+def test_curves_break_at_gaps_of_the_log():
+    told = story()
+    late = told._replace(times=told.times + np.where(np.arange(7) > 3, 5.0, 0.0))
+    lines = [trace for trace in drawn(late).data if trace.name == "f" and trace.x]
+    # Errors, NEES and the path of the belief: the fifth point is the break.
+    flat = [line for line in lines if line.type == "scatter"]
+    assert len(flat) == 3
+    assert all(line.x[4] is None and line.y[4] is None and len(line.x) == 8 for line in flat)
+    path = next(line for line in lines if line.type == "scatter3d" and len(line.x) == 8)
+    assert path.z[4] is None
+    assert path.z[3] is not None
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_every_moment_changes_the_same_traces(known):
     shown = drawn(story(known=known))
@@ -291,12 +304,13 @@ def test_a_replay_writes_its_page(with_truth, files, tmp_path, capsys):  # noqa:
     for name in {"ranges", "truth"} & given.keys():
         file = Path(given[name])
         file.write_text("\n".join(file.read_text().splitlines()[:32]))
-    options = ["--html", str(path), "--json", str(figures)]
+    options = ["--html", str(path), "--json", str(figures), *["--smooth"] * with_truth]
     assert main([*arguments(given), *options]) == 0
     text = path.read_text(encoding="utf-8")
     result = json.loads(figures.read_text())
     assert f"{result['epochs']} epochs" in text
     assert ("p95" in text) is with_truth
+    assert ("<h2>smoothed<" in text) is with_truth
     if BROWSER is not None and not with_truth:
         assert opened(path).count("<canvas") >= 2
 

@@ -42,7 +42,7 @@ def hard_figure(result: dict[str, Any]) -> Figure:
         axis.set_xticks(
             range(len(conditions)), [label.replace(", ", ",\n") for label in conditions]
         )
-        axis.legend(fontsize="medium", loc="upper left")
+    upper.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     after = result["starts"]["after"]
     axes = lower.subplots(1, len(result["starts"]["scenes"]), squeeze=False)[0]
     for axis, (name, starts) in zip(axes, result["starts"]["scenes"].items(), strict=True):

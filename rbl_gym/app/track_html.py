@@ -15,6 +15,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import ANCHOR, AXES, INK, body_edges, gapped
 from rbl_gym.studies.epochs import nees_interval
+from rbl_gym.studies.replay.figures import gaps_of
 
 # Moments of the slider, and epochs of the curves; longer tracks are thinned out.
 _MOMENTS, _POINTS = 120, 1500
@@ -96,6 +97,18 @@ def _thinned(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
+class _Curves:
+    """Thin arrays of K epochs out for curves, with a break at each gap without measurements."""
+
+    def __init__(self, times: FloatArray) -> None:
+        self._points = _thinned(len(times), _POINTS)
+        self._breaks = np.searchsorted(self._points, gaps_of(times), side="right")
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """Return values (K, ...) at the points of a curve; NaN at a break."""
+        return np.insert(np.asarray(values[self._points], float), self._breaks, np.nan, axis=0)
+
+
 # --- static part -------------------------------------------------------------------------------
 
 
@@ -112,20 +125,20 @@ def _add_still(shown: go.Figure, story: Story) -> None:
         row=1,
         col=1,
     )
-    points = _thinned(len(story.times), _POINTS)
+    curves = _Curves(story.times)
     if story.truth is not None:
         _, places, known = story.truth
-        path = np.where(known[:, None], places, np.nan)[points]
+        path = curves.of(np.where(known[:, None], places, np.nan))
         shown.add_trace(_wire(path, "#868e96", "true path", 5, showlegend=True), row=1, col=1)
     for name, belief in story.beliefs.items():
         style: dict[str, Any] = {"showlegend": True, "legendgroup": name}
-        path = _wire(belief.translation[points], belief.colour, name, 2, **style)
+        path = _wire(curves.of(belief.translation), belief.colour, name, 2, **style)
         shown.add_trace(path, row=1, col=1)
 
 
 def _add_curves(shown: go.Figure, story: Story) -> None:
-    points = _thinned(len(story.times), _POINTS)
-    times = solids.numbers(story.times[points], 6)
+    curves = _Curves(story.times)
+    times = solids.numbers(curves.of(story.times), 6)
     freedom = freedom_of(story)
     low, high = nees_interval(dof=freedom)
     for name, belief in story.beliefs.items():
@@ -139,7 +152,7 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
         for column, std in ((1, found.position_std_m), (3, found.rotation_std_deg)):
             shown.add_scatter(
                 x=times,
-                y=solids.numbers(3 * std[points]),
+                y=solids.numbers(curves.of(3 * std)),
                 fill="tozeroy",
                 fillcolor=_faint(belief.colour),
                 line={"width": 0},
@@ -150,7 +163,7 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
             )
         line = {"color": belief.colour, "width": 1.5}
         for column, values in ((1, found.position_m), (3, found.rotation_deg), (5, found.nees)):
-            curve = solids.numbers(values[points])
+            curve = solids.numbers(curves.of(values))
             shown.add_scatter(x=times, y=curve, name=name, line=line, col=column, **style)
     # Without this option plotly looks for two axes in the traces of 3-D scenes, too.
     where: dict[str, Any] = {"row": 2, "col": 5, "exclude_empty_subplots": False}

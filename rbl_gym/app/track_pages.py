@@ -138,7 +138,14 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
     # Data of 3-D pictures have seven digits, those of a map need more.
     origin = origin_of(recording)
     places = track.translation - origin
-    beliefs = Beliefs(track.rotation, places, track.covariance, COLOURS["iterated EKF"])
+    beliefs = {
+        settings.filter: Beliefs(track.rotation, places, track.covariance, COLOURS["iterated EKF"])
+    }
+    if replayed.smoothed is not None:
+        best = replayed.smoothed.track
+        beliefs["smoothed"] = Beliefs(
+            best.rotation, best.translation - origin, best.covariance, COLOURS["KF"]
+        )
     shown = None if truth is None else (truth.rotation, truth.translation - origin, truth.known)
     story = Story(
         times,
@@ -146,7 +153,7 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         recording.anchor_ids,
         recording.tags,
         shown,
-        {settings.filter: beliefs},
+        beliefs,
         "xy" if (settings.knowledge.planar if truth is None else truth.planar) else "xyz",
     )
     parts = [*map(page.note, result["notes"]), page.note(_LEGEND)]
@@ -155,13 +162,16 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         parts.append(page.note(f"Coordinates are relative to ({shift}) m."))
     parts.append(page.plot(track_html.track_figure(story), "track"))
     if truth is not None:
-        found = error_rows(result, result["position_axes"], turn_open(result))
-        rows = [[label, *cells] for label, cells in found]
-        parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
+        axes, is_open = result["position_axes"], turn_open(result)
+        for title in ("errors", "smoothed")[: len(beliefs)]:
+            found = error_rows(result if title == "errors" else result[title], axes, is_open)
+            rows = [[label, *cells] for label, cells in found]
+            parts.append(page.table(title, ["error", "RMSE", "median", "p95"], rows))
+        smoothed = f", smoothed {result['smoothed']['anees']:.2f}" if len(beliefs) > 1 else ""
         parts.append(
             page.note(
-                f"NEES per degree of freedom {result['anees']:.2f} (1: consistent; above: "
-                "overconfident; below: too cautious); "
+                f"NEES per degree of freedom {result['anees']:.2f}{smoothed} (1: consistent; "
+                "above: overconfident; below: too cautious); "
                 f"{'; '.join(compared(result))}."
             )
         )

@@ -16,6 +16,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.measurements.inertial import turned
 from rbl_gym.recordings.calibration import calibrated
 from rbl_gym.recordings.directions import read_directions
+from rbl_gym.recordings.faults import every_fault
 from rbl_gym.recordings.format import Files, Format
 from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial
 from rbl_gym.recordings.odometry import read_odometry
@@ -58,22 +59,24 @@ def read_recording(
     Raises
     ------
     ValueError
-        If a file is not as described, more than a fifth of the ranges are invalid, the units do
-        not fit together, or no epoch has a link. With `format.strict`, also at the first range or
-        row that would be dropped or sorted.
+        If a file is not as described (the message names every wrong file), more than a fifth of
+        the ranges are invalid, the units do not fit together, or no epoch has a link. With
+        `format.strict`, also at the first range or row that would be dropped or sorted.
     """
-    table, runs = _runs_of(files, format)
-    if run is None and len(runs) > 1:
-        raise ValueError(
-            f"{table.path}: has {len(runs)} runs, {[*runs]!r:.200}; choose one with run, or read "
-            "all with read_runs"
-        )
-    if run is not None:
-        if run not in runs:
-            held = f"got {[*runs]!r:.200}" if "run" in table.columns else "as it has no column run"
-            raise ValueError(f"{table.path}: has no run {run!r}, {held}")
-        table = table.select(runs[run])
-    return _read(files, table, run, format)
+    with every_fault(files, format):
+        table, runs = _runs_of(files, format)
+        if run is None and len(runs) > 1:
+            raise ValueError(
+                f"{table.path}: has {len(runs)} runs, {[*runs]!r:.200}; choose one with run, or "
+                "read all with read_runs"
+            )
+        if run is not None:
+            if run not in runs:
+                named = f"got {[*runs]!r:.200}"
+                held = named if "run" in table.columns else "as it has no column run"
+                raise ValueError(f"{table.path}: has no run {run!r}, {held}")
+            table = table.select(runs[run])
+        return _read(files, table, run, format)
 
 
 def read_runs(files: Files, format: Format = _AS_DESCRIBED) -> dict[str, Recording]:
@@ -83,11 +86,12 @@ def read_runs(files: Files, format: Format = _AS_DESCRIBED) -> dict[str, Recordi
     with the name ``""``. If the truth has this column too, each run has its own truth. A truth
     without time and with a single pose per run belongs to a body at rest.
     """
-    table, runs = _runs_of(files, format)
-    return {
-        run: _read(files, table if rows.all() else table.select(rows), run or None, format)
-        for run, rows in runs.items()
-    }
+    with every_fault(files, format):
+        table, runs = _runs_of(files, format)
+        return {
+            run: _read(files, table if rows.all() else table.select(rows), run or None, format)
+            for run, rows in runs.items()
+        }
 
 
 def _runs_of(files: Files, format: Format) -> tuple[Table, dict[str, np.ndarray]]:

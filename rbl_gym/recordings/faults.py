@@ -1,0 +1,94 @@
+"""Name all wrong files of a log in one message."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.recordings.format import Files, Format
+from rbl_gym.recordings.inertial import read_frame, read_inertial
+from rbl_gym.recordings.odometry import read_odometry
+from rbl_gym.recordings.points import read_points
+from rbl_gym.recordings.ranges import read_log
+from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.tables import read_table
+from rbl_gym.recordings.truth import read_truth
+
+
+@contextlib.contextmanager
+def every_fault(files: Files, format: Format) -> Iterator[None]:
+    """Context of reading a log: if a file is wrong, the error names the other wrong files too.
+
+    A single fault is raised as it is, several as a ValueError with one line for each.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        found = dict.fromkeys([_text(error), *_faults(files, format)])
+        if len(found) == 1:
+            raise
+        lines = "".join(f"\n  {text}" for text in found)
+        raise ValueError(f"{len(found)} files cannot be used:{lines}") from error
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{os.fspath(error.filename)}: {error.strerror}"
+    return str(error)
+
+
+def _faults(files: Files, format: Format) -> Iterator[str]:
+    """Yield the error of every file that cannot be read by itself."""
+    read: dict[str, Any] = {}
+    for name, work in _readers(files, format, read):
+        if getattr(files, name) is None:
+            continue
+        try:
+            read[name] = work()
+        except (ValueError, OSError) as error:
+            yield _text(error)
+
+
+def _readers(
+    files: Files, format: Format, read: dict[str, Any]
+) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Yield a function for each file. That of the ranges takes `read`, the previous results."""
+
+    def ranges() -> None:
+        table = read_table(files.ranges, format.of("ranges"))
+        points = [read.get(name) for name in ("anchors", "tags")]
+        if all(
+            known is not None or getattr(files, name) is None
+            for known, name in zip(points, ("anchors", "tags"), strict=True)
+        ):
+            read_log(table, *points, format, Said())
+        else:
+            table.seconds(format.time_unit)
+
+    for kind in ("anchor", "tag"):
+        name = f"{kind}s"
+        path = getattr(files, name)
+        yield (
+            name,
+            lambda path=path, kind=kind: read_points(path, kind, format.of(f"{kind}s"), Said()),
+        )
+    yield "ranges", ranges
+    # The times are for a body at rest.
+    for name in ("truth", "carrier"):
+        path = getattr(files, name)
+        yield (
+            name,
+            lambda path=path, name=name: read_truth(
+                path, format.of(name), times=np.array([0.0, 1.0])
+            ),
+        )
+    yield "calibration", lambda: read_table(str(files.calibration), format.of("calibration"))
+    how = {"wheelbase_m": format.wheelbase_m, "turn_unit": format.turn_unit}
+    yield "odometry", lambda: read_odometry(str(files.odometry), format.of("odometry"), **how)
+    columns = dict(format.of("imu").columns)
+    yield "imu", lambda: read_inertial(str(files.imu), columns=columns, turn_unit=format.turn_unit)
+    yield "imu_frame", lambda: read_frame(files.imu_frame)
