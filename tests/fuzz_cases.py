@@ -72,7 +72,6 @@ case(bodies.plate, length_m=1.0, width_m=1.0)
 case(motion.ProcessNoise, rotation_rad=0.1, translation_m=0.1)
 case(motion.propagate, **POSE, twist=TWIST, dt=0.1)
 case(motion.constant_twist, **POSE, twist=TWIST, steps=3)
-case(motion.random_twist, **POSE, turn_rate_rad_s=0.1, speed_m_s=1.0, steps=3, rng=Rng)
 case(motion.waypoints, rotation=Q, points=ANCHORS, speed_m_s=1.0, dt=0.1, steps=5)
 case(motion.orbit, centre=T, radius_m=2.0, speed_m_s=1.0, dt=0.1, steps=4, phase=0.0)
 for _law in ranging.NOISE_LAWS.values():

@@ -108,6 +108,21 @@ def simulate(rng, anchors, tags, rotation, translation, noise):
     return ranging.simulate(anchors, tags, rotation, translation, noise, rng).ranges
 
 
+def draw_biases(law, times, links, rng, batch=()):
+    """Biases (..., K, links) of a `LinkBias` at times (K,)."""
+    normals = rng.standard_normal((len(times), *batch, links + 1))
+    drawn = law.std_m * normals[..., :links] + law.common_std_m * normals[..., links:]
+    for k, step in enumerate(np.diff(times)):
+        kept = law.decay(step)
+        drawn[k + 1] = kept * drawn[k] + (1 - kept**2) ** 0.5 * drawn[k + 1]
+    return np.moveaxis(drawn, 0, -2)
+
+
+def is_legal(task, anchors):
+    """Whether each anchor (..., M) is at a legal position of the scene."""
+    return np.abs(task.scene.anchor_region.project(anchors) - anchors).max(axis=-1) <= 1e-6
+
+
 def assert_same(got: Any, want: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
     """Equal through dicts and sequences, arrays to the tolerances (0: to the last bit)."""
     if isinstance(want, dict):

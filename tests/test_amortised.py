@@ -33,7 +33,7 @@ from rbl_gym.placement.tokens import KINDS, Scenery, Tokens, tokens_of
 from rbl_gym.studies.placing import design
 from rbl_gym.studies.placing.answer import Question, place_anchors
 from rbl_gym.worlds import scenes
-from tests.helpers import ROOT, needs, with_kernels
+from tests.helpers import ROOT, is_legal, needs, with_kernels
 
 FEET = 1 / 0.3048
 # Tolerance of the network's outputs, in units of the problem; it is played in single precision.
@@ -228,7 +228,7 @@ def test_many_contexts_are_the_same_as_a_few_at_a_time():
     together = amortised.of_task(task, contexts, 6)
     one = amortised.of_task(task, placement.Context(*(field[4, 7] for field in contexts)), 6)
     np.testing.assert_allclose(together[4, 7], one, atol=SINGLE)
-    assert placement.is_legal(task, together).all()
+    assert is_legal(task, together).all()
 
 
 @pytest.mark.parametrize(("scene", "racks"), [("auv_buoys", 0), ("uwb_room", 2)])
@@ -360,7 +360,7 @@ def test_following_many_layouts_is_as_good_as_one_at_a_time(scene, n_anchors):
     ]
     evaluate = setting.of_task(task, contexts).score_and_gradient
     found = follow(evaluate, task.scene.anchor_region, start, 20)
-    assert placement.is_legal(task, found).all()
+    assert is_legal(task, found).all()
     before, after = (np.log(placement.score(task, contexts, x)) for x in (start, found))
     scipys = [np.log(descend(one, x, 20)[1]) for one, x in zip(settings, start, strict=True)]
     assert (after <= before).all()
@@ -491,7 +491,7 @@ def test_a_training_is_the_same_again_and_its_file_is_played(tmp_path):
     played = amortised.read(tmp_path / "network.npz")
     assert played.meta["seed"] == 4
     task, contexts = problem("auv_buoys", 4, 0, (2,))
-    assert placement.is_legal(task, amortised.of_task(task, contexts, 0, played)).all()
+    assert is_legal(task, amortised.of_task(task, contexts, 0, played)).all()
 
 
 def test_the_package_says_how_its_network_was_made():
@@ -512,7 +512,7 @@ def test_anchors_are_legal(scene, racks, n_anchors):
     task, contexts = problem(scene, n_anchors, racks, (5,))
     found = amortised.of_task(task, contexts)
     assert found.shape == (5, n_anchors, 3)
-    assert placement.is_legal(task, found).all()
+    assert is_legal(task, found).all()
 
 
 def test_anchors_stand_outside_of_obstacles():
@@ -521,7 +521,7 @@ def test_anchors_stand_outside_of_obstacles():
     task = placement.task(scene, 12)
     found = amortised.of_task(task, placement.whole_volume(task))
     assert not scene.obstruction.contain(found).any()
-    assert placement.is_legal(task, found).all()
+    assert is_legal(task, found).all()
 
 
 @needs("shapely")

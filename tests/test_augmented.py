@@ -11,11 +11,11 @@ from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.named import iekf_bias, iekf_cv
 from rbl_gym.geometry import bodies, rotations
-from rbl_gym.measurements import link_bias, ranging
+from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion import unknown_twist as ut
 from rbl_gym.worlds import scenes
-from tests.helpers import random_world, simulate, with_kernels
+from tests.helpers import draw_biases, random_world, simulate, with_kernels
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
@@ -195,9 +195,7 @@ def biased_recording(rng, trials, steps, law):
     heading[..., 2] = phase + np.pi / 2
     rotation = rotations.exp(heading)
     translation = np.stack([2 * np.cos(phase), 2 * np.sin(phase), 0 * phase], axis=-1)
-    biases = link_bias.simulate_biases(law, times, 24, rng, (trials,)).reshape(
-        (trials, steps, 8, 3)
-    )
+    biases = draw_biases(law, times, 24, rng, (trials,)).reshape((trials, steps, 8, 3))
     noise = ranging.RangeNoise(0.03)
     ranges = simulate(rng, anchors, tags, rotation, translation, noise) + biases
     twist = np.array([0, 0, 0.2, 0, 0, 0])
@@ -269,32 +267,6 @@ def test_biases_are_forgotten_as_their_law_says(twist):
     np.testing.assert_allclose(own, law.covariance(12), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"law": 0.1}, "law must be a LinkBias, got 0.1"),
-        ({"times": [1.0, 0.0]}, r"times must have shape \(K,\) and not decrease, got array"),
-        ({"links": 2.5}, "links must be a positive int, got 2.5"),
-        ({"rng": 7}, "rng must be a numpy.random.Generator, .* got 7"),
-    ],
-)
-def test_biases_that_cannot_be_drawn(changes, message):
-    good = {"law": LinkBias(), "times": [0.0, 1.0], "links": 3, "rng": np.random.default_rng(0)}
-    with pytest.raises(ValueError, match=message):
-        link_bias.simulate_biases(**{**good, **changes})
-
-
-def test_drawn_biases_have_their_laws_moments():
-    law = LinkBias(0.05, 2.0, 0.1)
-    drawn = link_bias.simulate_biases(law, [0.0, 1.0, 1.0], 3, np.random.default_rng(7), (20_000,))
-    np.testing.assert_array_equal(drawn[:, 2], drawn[:, 1])
-    for k in (0, 1):
-        got = drawn[:, k].T @ drawn[:, k] / 20_000
-        np.testing.assert_allclose(got, law.covariance(3), atol=5e-4)
-    crossed = drawn[:, 0].T @ drawn[:, 1] / 20_000
-    np.testing.assert_allclose(crossed, np.exp(-0.5) * law.covariance(3), atol=5e-4)
-
-
 def test_a_vague_prior_finds_its_pose_beside_one_that_knows():
     rng = np.random.default_rng(8)
     anchors, _, rotation, translation = random_world(rng, 6, 5, (3,))
@@ -331,7 +303,5 @@ def test_what_cannot_be_is_refused():
         iekf_bias(tags, NOISE, PROCESS, bias_std_m=-1)
     with pytest.raises(ValueError, match="time_s must be a finite number"):
         iekf_bias(tags, NOISE, PROCESS, bias_time_s=0)
-    with pytest.raises(ValueError, match="times must have"):
-        link_bias.simulate_biases(LinkBias(), [1.0, 0.0], 3, rng)
     with pytest.raises(ValueError, match="has no option 'bias_std_m'"):
         estimators.make("iekf-cv", tags=tags, noise=NOISE, process=PROCESS, bias_std_m=1)

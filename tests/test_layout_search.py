@@ -21,7 +21,7 @@ from rbl_gym.placement.search import (
     hybrid,
     shared_layout,
 )
-from tests.helpers import needs
+from tests.helpers import is_legal, needs
 
 QUICK = {"generations": 6, "population": 6}
 
@@ -141,7 +141,7 @@ def test_searches_are_legal_deterministic_and_better_than_chance(name, scene):
     options = QUICK if name == "cma-es" else {}
     found = SEARCHES[name](task, context, rng(), **options)
     assert found.shape == (2, 1, 4, 3)
-    assert placement.is_legal(task, found).all()
+    assert is_legal(task, found).all()
     assert found.tobytes() == SEARCHES[name](task, context, rng(), **options).tobytes()
     chance = layouts.random(task, expand(expand(context)), rng(5))
     chance = placement.score(task, expand(expand(context)), chance)[..., 0, 0]
@@ -203,7 +203,7 @@ def test_a_shared_layout_is_good_for_all():
     task, contexts = problem("auv_buoys", 4, (6,))
     found = shared_layout(task, contexts, rng(), 15, 8)
     assert found.shape == (4, 3)
-    assert placement.is_legal(task, found).all()
+    assert is_legal(task, found).all()
     assert found.tobytes() == shared_layout(task, contexts, rng(), 15, 8).tobytes()
     chance = task.scene.anchor_region.draw(rng(7).random((50, 1, 4, 3)))
     logs = np.log(placement.score(task, contexts, chance)).mean(axis=-1)

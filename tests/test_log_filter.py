@@ -15,9 +15,9 @@ from rbl_gym.estimators.named import iekf_log
 from rbl_gym.estimators.smoothing import Level
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.measurements.link_bias import LinkBias, simulate_biases
+from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist, simulate_wandering
-from tests.helpers import with_kernels
+from tests.helpers import draw_biases, with_kernels
 
 TAGS = bodies.octahedron(0.8)[:4]
 ANCHORS = np.array([[0.0, 0, 0], [10, 0, 3], [10, 8, 0], [0, 8, 3], [5, 0, 3], [5, 8, 0.5]])
@@ -40,7 +40,7 @@ def tracked(robust, late, trials=100, steps=25, dt=0.1, seed=0):
     shape = (trials, len(ANCHORS), len(TAGS))
     times, links = dt * np.arange(steps + 1), shape[1] * shape[2]
     laws = LinkBias(0.05, None, 0.1), LinkBias(0.05, 3.0)
-    biases = np.sum([simulate_biases(law, times, links, rng, (trials,)) for law in laws], axis=0)
+    biases = np.sum([draw_biases(law, times, links, rng, (trials,)) for law in laws], axis=0)
     filter: Any = estimators.make(
         "iekf-log", tags=TAGS, noise=NOISE, process=STILL, robust=robust,
         turn_rate_rad_s=0.3, speed_m_s=0.5,

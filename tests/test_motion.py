@@ -204,24 +204,15 @@ def test_constant_twist_is_the_same_at_every_step():
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_random_twist_has_exact_speeds_and_holds_its_directions(batch):
-    rng = np.random.default_rng(0)
-    pose = rotations.random(rng, batch), np.zeros(3)
-    twists = motion.random_twist(*pose, 1.5, 0.2, 25, rng, hold=10).twists
+def test_held_twists_have_exact_speeds_and_hold_their_directions(batch):
+    directions = np.random.default_rng(0).standard_normal((*batch, 3, 2, 3))
+    twists = motion.held_twists(directions, 0.2, 1.5, 25, 10)
     assert twists.shape == (*batch, 25, 6)
     np.testing.assert_allclose(np.linalg.norm(twists[..., :3], axis=-1), 0.2, rtol=1e-14)
     np.testing.assert_allclose(np.linalg.norm(twists[..., 3:], axis=-1), 1.5, rtol=1e-14)
     changes = np.abs(np.diff(twists, axis=-2)).max(axis=-1) > 0
     want = np.isin(np.arange(24), [9, 19])
     np.testing.assert_array_equal(changes, np.broadcast_to(want, changes.shape))
-
-
-def test_random_twist_has_no_preferred_direction():
-    rng = np.random.default_rng(1)
-    twists = motion.random_twist(np.eye(3), np.zeros(3), 1, 1, 4000, rng, hold=1).twists
-    # A coordinate of a uniform direction has variance 1/3; 4.5 deviations of the mean.
-    np.testing.assert_allclose(twists.mean(axis=0), 0, atol=4.5 / (3 * 4000) ** 0.5)
-    np.testing.assert_allclose(np.cov(twists.T), np.eye(6) / 3, atol=0.03)
 
 
 POINTS = np.array([[0.0, 0, 0], [4, 0, 0], [4, 3, 0], [4, 3, 0], [4, 3, 2]])  # one point twice
@@ -387,9 +378,6 @@ BAD_CALLS = {
     ),
     "twist shape": (motion.constant_twist, (I, O, O, 3), "twist must have shape (..., 6), got"),
     "not a rotation": (motion.constant_twist, (2 * I, O, TWIST, 3), "rotation must be orthogonal"),
-    "hold": (motion.random_twist, (I, O, 1, 1, 5, RNG, 0), "hold must be an int from 1 to"),
-    "speed nan": (motion.random_twist, (I, O, np.nan, 1, 5, RNG), "speed_m_s must be"),
-    "turn nan": (motion.random_twist, (I, O, 1, np.nan, 5, RNG), "turn_rate_rad_s must be"),
     "one point": (motion.waypoints, (I, [O], 1, 1, 5), "points must hold at least 2 way-points"),
     "point nan": (motion.waypoints, (I, I * np.nan, 1, 1, 5), "points must be finite"),
     "speed": (

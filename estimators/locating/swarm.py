@@ -25,6 +25,9 @@ Objective = Callable[[FloatArray], FloatArray]
 # A search has converged if its best distances moved less than this (units of the body's size) over
 # the last quarter of its steps.
 _STILL = 1e-3
+# Particle swarm: inertia, both attractions. Participatory search: learning rate, new individuals.
+_INERTIA, _ATTRACTION = 0.7298, 1.4962
+_LEARNING_RATE, _FRESH = 0.5, 40
 _SMALLEST_RAD = 1e-4  # least angle between directions that bounds a distance
 
 
@@ -40,8 +43,6 @@ class ParticleSwarm:
     size: int = 400
     steps: int = 120
     reach: float = 2.5
-    inertia: float = 0.7298
-    attraction: float = 1.4962
 
     def search(
         self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
@@ -65,8 +66,8 @@ class ParticleSwarm:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the next positions and velocities."""
         leader = _at(best, best_cost.argmin(axis=-1))
-        own, common = self.attraction * rng.random((2, *x.shape))
-        velocity = self.inertia * velocity + own * (best - x) + common * (leader[..., None] - x)
+        own, common = _ATTRACTION * rng.random((2, *x.shape))
+        velocity = _INERTIA * velocity + own * (best - x) + common * (leader[..., None] - x)
         return np.clip(x + velocity, 0.0, 1.0), velocity
 
 
@@ -90,9 +91,6 @@ class ParticipatorySearch:
     size: int = 400
     steps: int = 200
     reach: float = 1.0
-    learning_rate: float = 0.5
-    arousal: float = 0.0
-    fresh: int = 40
 
     def search(
         self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
@@ -103,21 +101,20 @@ class ParticipatorySearch:
         for _ in range(self.steps):
             child = self._children(x, cost, rng)
             x, cost = _better(x, cost, child, objective(child))
-            worst = np.argpartition(-cost, self.fresh, axis=-1)[..., : self.fresh]
-            new = rng.random((*shape, self.fresh))
+            worst = np.argpartition(-cost, _FRESH, axis=-1)[..., :_FRESH]
+            new = rng.random((*shape, _FRESH))
             np.put_along_axis(x, np.broadcast_to(worst, new.shape), new, axis=-1)
             np.put_along_axis(cost, worst, objective(new), axis=-1)
             yield _at(x, cost.argmin(axis=-1))
 
     def _children(self, x: FloatArray, cost: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return the mutated individuals of a step, one for each."""
-        power = 1 - self.arousal
         best = _at(x, cost.argmin(axis=-1))[..., None]
         other = np.roll(x, rng.integers(1, self.size), axis=-1)
         nearer = _compatibility(x, best) >= _compatibility(other, best)
         selected = np.where(nearer, x, other)
-        recombined = x + self.learning_rate * _compatibility(x, other) ** power * (other - x)
-        change = _compatibility(selected, recombined) ** power * (selected - recombined)
+        recombined = x + _LEARNING_RATE * _compatibility(x, other) * (other - x)
+        change = _compatibility(selected, recombined) * (selected - recombined)
         return np.clip(best + change, 0.0, 1.0)
 
 

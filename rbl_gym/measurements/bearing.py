@@ -219,17 +219,17 @@ def simulate(
     return noise.sample(true, rng.standard_normal(true.shape))
 
 
-def check_angles(value: ArrayLike, n_tags: int, name: str = "angles") -> FloatArray:
+def check_angles(value: ArrayLike, n_tags: int) -> FloatArray:
     """Return angles (..., 2, N) on [0, pi], or raise ValueError.
 
     Noisy angles outside [0, pi] by less than 0.1 rad are folded back.
     """
-    checked = check_finite(name, check_shape(name, value, (2, n_tags)))
+    checked = check_finite("angles", check_shape("angles", value, (2, n_tags)))
     wrong = (checked < -0.1) | (checked > np.pi + 0.1)
     if wrong.any():
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise ValueError(
-            f"{name} must be angles in radians on [0, pi], got {checked[index]} at {index}"
+            f"angles must be angles in radians on [0, pi], got {checked[index]} at {index}"
         )
     return fold(checked)
 

@@ -10,11 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_count, check_generator, check_number
+from rbl_gym.checks import FloatArray, check_number
 
-__all__ = ["LinkBias", "simulate_biases"]
+__all__ = ["LinkBias"]
 
 
 @dataclass(frozen=True)
@@ -48,39 +47,3 @@ class LinkBias:
     def decay(self, dt: float) -> float:
         """Return the correlation over `dt` seconds."""
         return 1.0 if self.time_s is None else math.exp(-dt / self.time_s)
-
-
-def simulate_biases(
-    law: LinkBias,
-    times: ArrayLike,
-    links: int,
-    rng: np.random.Generator,
-    batch: tuple[int, ...] = (),
-) -> FloatArray:
-    """Simulate biases (..., K, links) in metres at times (K,).
-
-    Parameters
-    ----------
-    law, times, links
-        `LinkBias`, seconds (K,) that do not decrease, and the number of links.
-    rng, batch
-        Source of the normals, and the leading axes.
-
-    Raises
-    ------
-    ValueError
-        If the times decrease, or the law, the number of links or the generator is invalid.
-    """
-    if not isinstance(law, LinkBias):
-        raise ValueError(f"law must be a LinkBias, got {law!r:.80}")
-    times = check_array("times", times, ("K",))
-    if times.ndim != 1 or (np.diff(times) < 0).any():
-        raise ValueError(f"times must have shape (K,) and not decrease, got {times!r:.80}")
-    links = check_count("links", links)
-    check_generator("rng", rng)
-    normals = rng.standard_normal((len(times), *batch, links + 1))
-    drawn = law.std_m * normals[..., :links] + law.common_std_m * normals[..., links:]
-    for k, step in enumerate(np.diff(times)):
-        kept = law.decay(step)
-        drawn[k + 1] = kept * drawn[k] + math.sqrt(1 - kept**2) * drawn[k + 1]
-    return np.moveaxis(drawn, 0, -2)

@@ -14,19 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from rbl_gym.checks import (
-    BoolArray,
-    FloatArray,
-    check_array,
-    check_count,
-    check_generator,
-    check_number,
-    check_one_of,
-)
+from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 
-__all__ = ["OFFSETS", "Clock", "centred", "common", "simulate_clocks"]
+__all__ = ["OFFSETS", "Clock", "centred", "common"]
 
 # The axes of (..., M, N) along which ranges share one offset.
 _AXES = {"tag": (-2,), "anchor": (-1,), "epoch": (-2, -1)}
@@ -69,40 +60,6 @@ class Clock:
             [wander * dt**2 / 2, wander * dt],
         ]
         return np.array([[1.0, dt], [0.0, 1.0]]), np.array(Q)
-
-
-def simulate_clocks(
-    law: Clock, times: ArrayLike, groups: int, rng: np.random.Generator, batch: tuple[int, ...] = ()
-) -> FloatArray:
-    """Simulate offsets (..., K, groups) in metres at times (K,), from the law about zero.
-
-    Parameters
-    ----------
-    law, times, groups
-        `Clock`, seconds (K,) that do not decrease, and the number of clocks.
-    rng, batch
-        Source of the normals, and the leading axes.
-
-    Raises
-    ------
-    ValueError
-        If the times decrease, or the law, the number of groups or the generator is invalid.
-    """
-    if not isinstance(law, Clock):
-        raise ValueError(f"law must be a Clock, got {law!r:.80}")
-    times = check_array("times", times, ("K",))
-    if times.ndim != 1 or (np.diff(times) < 0).any():
-        raise ValueError(f"times must have shape (K,) and not decrease, got {times!r:.80}")
-    groups = check_count("groups", groups)
-    check_generator("rng", rng)
-    normals = rng.standard_normal((len(times), *batch, groups, 2))
-    states = [normals[0] * [law.std_m, law.drift_m_s]]
-    for dt, normal in zip(np.diff(times), normals[1:], strict=True):
-        F, Q = law.transition(float(dt))
-        values, vectors = np.linalg.eigh(Q)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        states.append(states[-1] @ F.T + normal @ root.T)
-    return np.stack([state[..., 0] for state in states], axis=-2)
 
 
 def check_offset(offset: str | None) -> str | None:

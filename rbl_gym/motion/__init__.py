@@ -14,7 +14,6 @@ from rbl_gym.motion.trajectories import (
     interpolate,
     lawn_mower_points,
     orbit,
-    random_twist,
     recorded,
     waypoints,
 )
@@ -29,7 +28,6 @@ __all__ = [
     "lawn_mower_points",
     "orbit",
     "propagate",
-    "random_twist",
     "recorded",
     "simulate",
     "twists_between",

@@ -30,6 +30,8 @@ __all__ = ["Preintegrated", "attitude", "gravity", "preintegrate"]
 # Internal functions without checks: their arguments were checked, or made here.
 _EXP, _HAT = kernel(rotations.exp), kernel(rotations.hat)
 _LEFT_JACOBIAN = kernel(rotations.left_jacobian)
+# Standard deviation of the mean acceleration of a body whose attitude is estimated, per axis.
+_ACCELERATION_M_S2 = 0.5
 
 
 class Preintegrated(NamedTuple):
@@ -244,19 +246,16 @@ def propagate(
     )
 
 
-def attitude(
-    readings: ArrayLike, sensor: InertialSensor, acceleration_m_s2: float = 0.5
-) -> tuple[FloatArray, FloatArray]:
+def attitude(readings: ArrayLike, sensor: InertialSensor) -> tuple[FloatArray, FloatArray]:
     """Estimate the attitude of a body, without heading, from the mean specific force of readings.
 
     Parameters
     ----------
     readings
-        (..., S, 6), while the acceleration of the body is small.
+        (..., S, 6), while the mean acceleration of the body is small: a standard deviation of 0.5
+        m/s^2 per axis is assumed.
     sensor
         Sensor with the standard deviation of its bias.
-    acceleration_m_s2
-        Standard deviation of the mean acceleration of the body, per axis.
 
     Returns
     -------
@@ -272,7 +271,6 @@ def attitude(
         are wrong.
     """
     readings = check_array("readings", readings, ("S", 6))
-    wide = check_number("acceleration_m_s2", acceleration_m_s2, low=0.0)
     force = readings[..., 3:].mean(axis=-2)
     magnitude, usual = np.linalg.norm(force, axis=-1, keepdims=True), float(sensor.numbers[4])
     if (np.abs(magnitude / usual - 1) > 0.5).any():
@@ -285,6 +283,6 @@ def attitude(
     roll = np.arctan2(up[..., 1], up[..., 2])
     pitch = np.arctan2(-up[..., 0], np.hypot(up[..., 1], up[..., 2]))
     rotation = rotations.from_euler_zyx(0.0, pitch, roll)
-    variance = (wide**2 + sensor.accel_bias_m_s2**2) / usual**2
+    variance = (_ACCELERATION_M_S2**2 + sensor.accel_bias_m_s2**2) / usual**2
     covariance = np.diag([variance, variance, np.pi**2 / 3])
     return rotation, np.broadcast_to(covariance, rotation.shape).copy()

@@ -14,8 +14,7 @@ from rbl_gym.kernels import compiled
 from rbl_gym.motion.kinematics import Path, Trajectory, twists_between
 
 __all__ = [
-    "constant_twist", "interpolate", "lawn_mower_points", "orbit", "random_twist", "recorded",
-    "waypoints",
+    "constant_twist", "interpolate", "lawn_mower_points", "orbit", "recorded", "waypoints",
 ]  # fmt: skip
 
 _MOST_STEPS = 10**9
@@ -30,35 +29,6 @@ def constant_twist(
     twist = check_array("twist", twist, (6,))
     steps = check_count("steps", steps, most=_MOST_STEPS)
     twists = np.repeat(twist[..., None, :], steps, axis=-2)
-    return Trajectory(rotation, translation, twists)
-
-
-def random_twist(
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    speed_m_s: float,
-    turn_rate_rad_s: float,
-    steps: int,
-    rng: np.random.Generator,
-    hold: int = 10,
-) -> Trajectory:
-    """Return a trajectory whose direction and rotation axis are redrawn every `hold` steps.
-
-    Speed and turn rate are constant and directions are uniform on the sphere. The distance from the
-    start is therefore bounded by ``speed * time``.
-
-    It starts at a pose (`rotation`, `translation`), with `speed_m_s` and `turn_rate_rad_s`; `rng`
-    is the source of randomness.
-    """
-    rotation = rotations.check_rotation("rotation", rotation)
-    translation = check_array("translation", translation, (3,))
-    steps = check_count("steps", steps, most=_MOST_STEPS)
-    hold = check_count("hold", hold, most=_MOST_STEPS)
-    speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
-    turn_rate_rad_s = check_number("turn_rate_rad_s", turn_rate_rad_s, low=0.0)
-    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    directions = rng.standard_normal((*batch, -(-steps // hold), 2, 3))
-    twists = held_twists(directions, turn_rate_rad_s, speed_m_s, steps, hold)
     return Trajectory(rotation, translation, twists)
 
 

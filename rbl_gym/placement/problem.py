@@ -20,7 +20,6 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import (
-    BoolArray,
     FloatArray,
     all_finite,
     as_float,
@@ -38,7 +37,7 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = [
     "Context", "PlacementTask", "draw_contexts",
-    "information", "is_legal", "mounts", "positions", "score", "score_of", "sight_fractions",
+    "information", "mounts", "positions", "score", "score_of", "sight_fractions",
     "task", "whole_volume",
 ]  # fmt: skip
 
@@ -392,9 +391,3 @@ def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) 
     if not in_the_way:
         return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
     return in_the_way.sees(anchors, positions(task, context)).mean(axis=-2)
-
-
-def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:
-    """Return whether each anchor (..., M) is at a legal position of the scene."""
-    off = np.abs(task.scene.anchor_region.project(anchors) - anchors).max(axis=-1)
-    return np.asarray(off <= tolerance_m)

@@ -24,6 +24,8 @@ __all__ = [
     "greedy_swaps", "hybrid", "shared_layout",
 ]  # fmt: skip
 
+# Candidates of `greedy`.
+_DRAWN = 150
 # Candidates of a greedy start, rounds of fresh ones after them, and then gradient steps.
 _CANDIDATES, _ROUNDS, _STEPS = 100, 3, 12
 # Hybrid search: greedy starts, turns of fresh candidates and gradient, steps of each turn.
@@ -49,7 +51,6 @@ def greedy(
     context: Context,
     rng: np.random.Generator,
     candidates: FloatArray | None = None,
-    n_candidates: int = 150,
     swaps: bool = False,
 ) -> FloatArray:
     """Add one anchor after the other, each the best among candidates.
@@ -61,13 +62,13 @@ def greedy(
     rng
         Draws the candidates.
     candidates
-        Candidates (K, 3); None: `n_candidates` uniform legal positions, separate for each context.
+        Candidates (K, 3); None: 150 uniform legal positions, separate for each context.
     swaps
         Whether to replace single anchors by candidates afterwards, as long as this helps.
     """
     batch = context.centre.shape[:-1]
     if candidates is None:
-        drawn = task.scene.anchor_region.draw(rng.random((*batch, n_candidates, 3)))
+        drawn = task.scene.anchor_region.draw(rng.random((*batch, _DRAWN, 3)))
     else:
         shared = check_array("candidates", candidates, ("K", 3))
         drawn = np.broadcast_to(shared, (*batch, *shared.shape[-2:]))

@@ -20,6 +20,8 @@ TURN_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 FORCE_UNITS = {"m/s^2": 1.0, "g": GRAVITY_M_S2}
 # Upper limit of turn rates, and limits of the median specific force under gravity.
 _MAX_RATE, _FORCE = 150.0, (0.3, 4.0)
+# Longest time without a reading that is bridged, also outside the log.
+_LONGEST_GAP_S = 0.1
 
 
 class InertialLog(NamedTuple):
@@ -107,7 +109,7 @@ def read_frame(told: AnyPath) -> FloatArray:
 
 
 def samples_between(
-    log: InertialLog, start_s: float, end_s: float, max_gap_s: float = 0.1
+    log: InertialLog, start_s: float, end_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the readings (S, 6) between two times, and the duration (S,) of each in seconds.
 
@@ -117,17 +119,14 @@ def samples_between(
     ----------
     log, start_s, end_s
         The log, and two times on its clock, the second not before the first.
-    max_gap_s
-        Longest time without a reading that is bridged, also outside the log.
 
     Raises
     ------
     ValueError
-        If the times are not in order, or the log has a longer gap between them.
+        If the times are not in order, or there is no reading for more than 0.1 s between them.
     """
     start_s = check_number("start_s", start_s)
     end_s = check_number("end_s", end_s, low=start_s)
-    max_gap_s = check_number("max_gap_s", max_gap_s, low=0.0)
     times = log.times
     middle = 0.5 * (times[1:] + times[:-1])
     first, last = np.searchsorted(middle, [start_s, end_s])
@@ -136,9 +135,9 @@ def samples_between(
     near = times[max(np.searchsorted(times, start_s, side="right") - 1, 0) :]
     near = near[: np.searchsorted(near, end_s) + 1]
     gap = max(float(np.diff(near).max(initial=0.0)), times[0] - start_s, end_s - times[-1])
-    if gap > max_gap_s:
+    if gap > _LONGEST_GAP_S:
         raise ValueError(
             f"log must have readings from {start_s:g} to {end_s:g} s without gaps longer than "
-            f"max_gap_s = {max_gap_s:g}, got a gap of {gap:.3g} s"
+            f"{_LONGEST_GAP_S:g} s, got a gap of {gap:.3g} s"
         )
     return log.readings[first : last + 1], np.diff(edges)

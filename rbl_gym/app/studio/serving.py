@@ -23,7 +23,7 @@ _LOOPBACK = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 _FOREIGN = "host must be an address of this machine, got {!r}"
 
 
-def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym studio") -> Any:
+def open_server(host: str = "127.0.0.1", port: int = 8080) -> Any:
     """Open a viser server with the theme of the studio.
 
     Other machines can open the page unless the address `host` is loopback. The first free port from
@@ -36,7 +36,7 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym
     port = _free_port(host, check_count("port", port, least=0, most=65535))
     # viser would print a frame of its own.
     with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):
-        server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        server: Any = viser.ViserServer(host=host, port=port, label="rbl-gym studio", verbose=False)
     # A browser could request a tunnel to the internet.
     server.request_share_url = lambda *_, **__: None
     server.gui.configure_theme(

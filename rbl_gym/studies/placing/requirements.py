@@ -209,17 +209,12 @@ def _rank(share: float, count: int) -> int:
     return min(max(math.ceil(share * count - 1e-9) - 1, 0), count - 1)
 
 
-def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the confidence interval of the share of a zone, from uniform positions (Wilson, 1927).
+def wilson_interval(within: int, places: int) -> tuple[float, float]:
+    """Return the 95 % interval of the share of a zone, from uniform positions (Wilson, 1927).
 
-    Parameters
-    ----------
-    within, places
-        Number of positions within the requirement, and of all positions.
-    level
-        Probability that the interval contains the share.
+    `within` of all `places` are within the requirement.
     """
-    z = math.sqrt(2) * float(special.erfinv(level))
+    z = float(special.ndtri(0.975))
     share = within / places
     middle = share + z * z / (2 * places)
     half = z * math.sqrt(share * (1 - share) / places + z * z / (4 * places**2))
@@ -227,21 +222,14 @@ def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[floa
     return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
-def set_interval(shares: FloatArray, level: float = 0.95) -> tuple[float, float]:
-    """Return the confidence interval of the share of a zone, from independent sets of positions.
+def set_interval(shares: FloatArray) -> tuple[float, float]:
+    """Return the 95 % interval of the share of a zone, from shares (K,) of independent sets.
 
-    It is Student's interval of the mean. Unlike `wilson_interval` it takes into account that each
-    set fills the zone evenly.
-
-    Parameters
-    ----------
-    shares
-        Share of the positions within the requirement, of each set (K), K at least 2.
-    level
-        Probability that the interval contains the share.
+    It is Student's interval of the mean of at least two sets. Unlike `wilson_interval` it takes
+    into account that each set fills the zone evenly.
     """
     mean, deviation = float(shares.mean()), float(shares.std(ddof=1))
-    t = float(special.stdtrit(len(shares) - 1, 0.5 + 0.5 * level))
+    t = float(special.stdtrit(len(shares) - 1, 0.975))
     half = t * deviation / math.sqrt(len(shares))
     return max(0.0, mean - half), min(1.0, mean + half)
 
