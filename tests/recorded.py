@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rbl_gym import motion
-from rbl_gym.geometry import rotations
+from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
@@ -16,6 +16,15 @@ ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0]
 # Of `honest_track`.
 STD_RAD, STD_M = 0.03, 0.03
 CORNERS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
+
+
+def recording(times, ranges, anchors, tags, truth=None, **more) -> Recording:
+    """Ranges (K, M, N), measured where above 0; anchors A0, A1, ..., tags T0, T1, ..."""
+    ids = (
+        tuple(f"{letter}{k}" for k in range(ranges.shape[axis]))
+        for letter, axis in (("A", 1), ("T", 2))
+    )
+    return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, truth, **more)
 
 
 def flight(tags, move=lambda times: ROOM, biases=0.0, count=60, shift=0.0) -> Recording:
@@ -29,9 +38,8 @@ def flight(tags, move=lambda times: ROOM, biases=0.0, count=60, shift=0.0) -> Re
     exact = ranging.distances(anchors, points)
     off = biases * rng.standard_normal(exact.shape[1:])
     ranges = exact + off + 0.05 * rng.standard_normal(exact.shape)
-    ids = tuple(map(str, range(len(ROOM)))), tuple(map(str, range(len(tags))))
     truth = Truth(times, path.rotation, path.translation + shift)
-    return Recording(times, ranges, ranges > 0, None, anchors + shift, tags, *ids, truth)
+    return recording(times, ranges, anchors + shift, tags, truth)
 
 
 def swaying(times: np.ndarray) -> np.ndarray:
@@ -57,9 +65,8 @@ def honest_track(truth, times, tags, seed=0):
     place = place + STD_M * rng.standard_normal(place.shape)
     P = np.diag([STD_RAD**2] * 3 + [STD_M**2] * 3)
     track = replay.Track(times, rotation, place, np.tile(P, (len(times), 1, 1)))
-    links = np.ones((len(times), len(CORNERS), len(tags)), bool)
-    ids = tuple("abcd"), tuple(map(str, range(len(tags))))
-    return Recording(times, 5.0 * links, links, None, CORNERS, tags, *ids, truth), track
+    ranges = np.full((len(times), len(CORNERS), len(tags)), 5.0)
+    return recording(times, ranges, CORNERS, tags, truth), track
 
 
 def table(path: Path, header: str, rows) -> str:
@@ -72,6 +79,17 @@ def table(path: Path, header: str, rows) -> str:
 def points(path: Path, name: str, places) -> str:
     """A file of these places, called 0, 1, ..."""
     return table(path, f"{name},x,y,z", ([i, *place] for i, place in enumerate(places)))
+
+
+def walk(epochs: int, seed: int):
+    """Anchors, tags, times, ranges and path of a body that turns and flies through a room."""
+    tags = bodies.octahedron(0.8)
+    anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
+    twists = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], epochs - 1)
+    path = motion.simulate(twists, 0.2, motion.ProcessNoise())
+    noise, rng = ranging.RangeNoise(0.03), np.random.default_rng(seed)
+    ranges = ranging.simulate(anchors, tags, *path, noise, rng).ranges
+    return anchors, tags, 0.2 * np.arange(epochs), ranges, path
 
 
 def files(folder: Path, anchors, tags, times, ranges, truth=None) -> dict[str, str]:

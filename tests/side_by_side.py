@@ -32,6 +32,33 @@ def actions_of(env: Any, rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(-1.3, 1.3, env.action_space.shape).astype(np.float32)
 
 
+Step = tuple[Any, float, bool, bool, dict[str, Any]]
+
+
+def played(env: Any, seed: int = 0, steps: int | None = None) -> tuple[list[Step], list[Any]]:
+    """An episode of a scalar environment, or `steps` of it, under random actions; these actions.
+
+    The reset comes first, as a step with reward 0.
+    """
+    env.action_space.seed(seed)
+    observation, info = env.reset(seed=seed)
+    results: list[Any] = [(observation, 0.0, False, False, info)]
+    actions: list[Any] = []
+    while len(actions) != steps and not (results[-1][2] or results[-1][3]):
+        actions.append(env.action_space.sample())
+        results.append(env.step(actions[-1]))
+        assert len(actions) < 10**5
+    for observation, *paid, _ in results:
+        assert env.observation_space.contains(observation)
+        assert [type(value) for value in paid] == [float, bool, bool]
+    return results, actions
+
+
+def episode(env: Any, seed: int = 0, steps: int | None = None) -> list[Step]:
+    """The steps of `played`."""
+    return played(env, seed, steps)[0]
+
+
 def assert_steps_alike(
     native: Any, peer: Any, steps: int, seed: Any, tolerance: dict[str, float]
 ) -> list[Any]:

@@ -15,7 +15,7 @@ from rbl_gym.estimators.calibration.survey_start import (
     anchors_from_points,
     start_from_anchors,
 )
-from rbl_gym.recordings import Files, Recording, align_positions, apply_alignment, read_recording
+from rbl_gym.recordings import Files, align_positions, apply_alignment, read_recording
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import AnchorSettings, SurveyedAnchors
 from tests import recorded
@@ -44,9 +44,7 @@ def simulate(rng, anchors, tags, epochs=150, noise=0.05, bias=0.0, planar=True):
 
 
 def recording_of(ranges, anchors, tags=TAGS):
-    ids = tuple(f"A{m}" for m in range(len(anchors))), tuple(str(n) for n in range(len(tags)))
-    times = 0.5 * np.arange(len(ranges))
-    return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, None)
+    return recorded.recording(0.5 * np.arange(len(ranges)), ranges, anchors, tags)
 
 
 def off(found, true):

@@ -20,7 +20,7 @@ from rbl_gym.estimators.calibration import (
 )
 from rbl_gym.estimators.calibration.clock import Clock, find_clock
 from rbl_gym.estimators.calibration.drift import NO_DRIFT, Drift, Whitener, find_drift
-from rbl_gym.recordings import Files, Recording, Truth, read_recording
+from rbl_gym.recordings import Files, Truth, read_recording
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import CalibratedLinks, LinkSettings
 from tests import recorded
@@ -69,8 +69,7 @@ def ranges_of(
 
 
 def recording_of(times, ranges, truth, tags=TAGS):
-    ids = tuple(f"A{m}" for m in range(len(ANCHORS))), tuple(f"T{n}" for n in range(len(tags)))
-    return Recording(times, ranges, ranges > 0, None, ANCHORS, tags, *ids, truth)
+    return recorded.recording(times, ranges, ANCHORS, tags, truth)
 
 
 def test_standard_deviations_are_honest_with_white_noise_and_late_ranges():

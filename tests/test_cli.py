@@ -15,7 +15,7 @@ import pytest
 
 from rbl_gym import estimators, motion, recordings
 from rbl_gym.app.cli import main
-from rbl_gym.geometry import bodies, rotations
+from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import replay
 from rbl_gym.studies.papers import camsap2013
@@ -113,16 +113,9 @@ def test_only_the_iterated_ekf_reaches_the_bound(experiment):
 @pytest.fixture
 def files(tmp_path):
     """A body turning and flying through a room for 20 s, 3-D, with its truth."""
-    rng = np.random.default_rng(1)
-    tags = bodies.octahedron(0.8)
-    anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
-    start = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], 100)
-    path = motion.simulate(start, 0.2, motion.ProcessNoise())
-    ranges = ranging.simulate(
-        anchors, tags, path.rotation, path.translation, ranging.RangeNoise(0.03), rng
-    ).ranges
+    anchors, tags, times, ranges, path = recorded.walk(101, 1)
     ranges[7, 0, 4] = np.nan
-    return recorded.files(tmp_path, anchors, tags, 0.2 * np.arange(101), ranges, path)
+    return recorded.files(tmp_path, anchors, tags, times, ranges, path)
 
 
 def arguments(files):

@@ -49,6 +49,7 @@ from tests.side_by_side import (
     assert_mixes_alike,
     assert_steps_alike,
     assert_twins_go_on_alike,
+    episode,
     of_its_spec,
     peer_of,
 )
@@ -228,17 +229,6 @@ LONG = {
 }
 
 
-def episode(env: Any, seed: int, limit: int = 8) -> list[Any]:
-    """The reset and the steps of an episode of a scalar environment, at most so many."""
-    env.action_space.seed(seed)
-    steps: list[Any] = [env.reset(seed=seed)]
-    while len(steps) <= limit and (len(steps) == 1 or not (steps[-1][2] or steps[-1][3])):
-        steps.append(env.step(env.action_space.sample()))
-        assert env.observation_space.contains(steps[-1][0])
-        assert [type(value) for value in steps[-1][1:4]] == [float, bool, bool]
-    return steps
-
-
 @every_world
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
 def test_gymnasiums_checker_has_no_complaint(world):
@@ -250,12 +240,12 @@ def test_gymnasiums_checker_has_no_complaint(world):
 @every_world
 def test_specs_copies_and_seeds_give_the_same_episode(world):
     env = world.make()
-    want = episode(env, 3)
+    want = episode(env, 3, 8)
     # By the length in the spec Gymnasium adds its limit, which speaks at the end.
-    again = episode(of_its_spec(env), 3)
+    again = episode(of_its_spec(env), 3, 8)
     assert_same([step[:3] for step in again], [step[:3] for step in want])
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env)), env):
-        assert_same(episode(twin, 3), want)
+        assert_same(episode(twin, 3, 8), want)
     for other in (env.reset(), env.reset(seed=4)):
         with pytest.raises(AssertionError):
             assert_same(other[0], want[0][0])

@@ -11,11 +11,11 @@ from rbl_gym.app import consistency, figures, reports
 from rbl_gym.estimators import Innovations
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings import Recording
 from rbl_gym.studies import replay
 from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.groups import innovations_of
 from rbl_gym.studies.replay.tracking import start_of
+from tests import recorded
 from tests.helpers import with_kernels
 
 ANCHORS = np.array(
@@ -41,10 +41,7 @@ def walked(seed: int, logs: int = 1, epochs: int = 70, planar: bool = False):
 
 
 def recording(ranges, anchors=ANCHORS, tags=TAGS):
-    times = 0.1 * np.arange(len(ranges))
-    ids = tuple(f"A{m}" for m in range(len(anchors))), tuple(f"T{n}" for n in range(len(tags)))
-    links = np.ones(ranges.shape, dtype=bool)
-    return Recording(times, ranges, links, None, anchors, tags, *ids, None)
+    return recorded.recording(0.1 * np.arange(len(ranges)), ranges, anchors, tags)
 
 
 RANGES = walked(1)[0]

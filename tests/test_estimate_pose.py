@@ -18,6 +18,7 @@ from rbl_gym.worlds import scene_bounds
 from rbl_gym.worlds.scenes import SCENES
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same, score_by_hand
+from tests.side_by_side import episode
 
 ID = "rbl_gym:RBL/Tracking-v0"
 NAMES = list(SCENES)
@@ -38,17 +39,6 @@ def raw(scene: Any, **options: Any) -> gym.Env:
 
 def wrapped(scene: Any, filter: str = "iekf", **arguments: Any) -> EstimatePose:
     return EstimatePose(raw(scene), filter, **arguments)
-
-
-def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> list[Any]:
-    """A whole episode (or `steps` of it) under random actions of that seed."""
-    env.action_space.seed(seed)
-    results: list[Any] = [(*env.reset(seed=seed),)]
-    while len(results) != (steps or 10**6) + 1:
-        results.append(env.step(env.action_space.sample()))
-        if results[-1][3]:
-            break
-    return results
 
 
 # --- the filter by hand -----------------------------------------------------------------------
@@ -75,12 +65,12 @@ def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options
         **options,
     )  # fmt: skip
     runs = {
-        reward: rollout(wrapped(scene, filter, options=options, reward=reward), 1)
+        reward: episode(wrapped(scene, filter, options=options, reward=reward), 1)
         for reward in ("belief", "error")
     }
     tags = np.array(world.scene.tags)
     state = None
-    for k, result in enumerate(rollout(env, 1)):
+    for k, result in enumerate(episode(env, 1)):
         seen, info = result[0], result[-1]
         if state is None:
             prior = info["prior_rotation"], info["prior_translation"], info["prior_covariance"]
@@ -119,8 +109,8 @@ def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_the_environment_says_passes_through(name):
-    got = rollout(wrapped(short(name)), 2)
-    want = rollout(raw(short(name), reward="none"), 2)
+    got = episode(wrapped(short(name)), 2)
+    want = episode(raw(short(name), reward="none"), 2)
     for a, b in zip(got, want, strict=True):
         assert_same({key: a[-1][key] for key in b[-1]}, b[-1])
         assert a[2:-1] == b[2:-1]
@@ -147,11 +137,11 @@ class Watched(gym.Wrapper):
 @pytest.mark.parametrize("reward", ["bound", "none"])
 @pytest.mark.parametrize("name", ["uwb_room", "hall", "satellite"])
 def test_wrappers_below_see_the_environment_as_it_is(name, reward):
-    want = rollout(raw(short(name), reward=reward), 2)
+    want = episode(raw(short(name), reward=reward), 2)
     below = Watched(raw(short(name), reward=reward))
-    above = rollout(EstimatePose(below), 2)
+    above = episode(EstimatePose(below), 2)
     for got, mine, plain in zip(below.seen, above, want, strict=True):
-        assert got[1:-1] == plain[1:-1]
+        assert got[1:-1] == plain[1 : len(got) - 1]
         assert_same(got[0], plain[0])
         assert_same(got[-1], plain[-1])
         assert mine[-1].get("bound_m") == plain[-1].get("score_m")
@@ -166,7 +156,7 @@ def test_without_a_reward_of_the_environment_no_bound_is_computed(monkeypatch):
     monkeypatch.setattr(scene_bounds, "posterior_step", refuse)
     with pytest.raises(AssertionError, match="the bound"):
         wrapped(short("uwb_room")).reset(seed=0)
-    assert len(rollout(EstimatePose(raw(short("uwb_room"), reward="none")))) == 13
+    assert len(episode(EstimatePose(raw(short("uwb_room"), reward="none")))) == 13
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -194,7 +184,7 @@ def test_kalman_family_tracks(filter, name):
     steps = min(SCENES[name].steps, 40)
     env = wrapped(short(name, steps), filter, reward="error" if filter == "kf" else "belief")
     scene = SCENES[name]
-    results = rollout(env, 3)
+    results = episode(env, 3)
     assert len(results) == steps + 1
     start = score_by_hand(scene.prior_covariance, np.eye(3), np.array(scene.tags))
     last = [result[-1]["tag_error_m"] for result in results[-5:]]
@@ -228,7 +218,7 @@ def test_flat_observation_is_float32_and_in_its_space(name):
     env = wrapped(name, observation="flat")
     size = 21 + 4 * SCENES[name].n_anchors
     assert env.observation_space == spaces.Box(-10.0, 10.0, (size,), np.float32)
-    for result in rollout(env, 9):
+    for result in episode(env, 9):
         assert result[0].dtype == np.float32
         assert env.observation_space.contains(result[0])
 
@@ -236,15 +226,15 @@ def test_flat_observation_is_float32_and_in_its_space(name):
 @pytest.mark.parametrize("name", ["uwb_room", "drone_yard", "auv_buoys", "satellite"])
 def test_flat_observation_is_of_order_one(name):
     """What a policy reads is neither cut nor vanishing: at most 1 % of the numbers at the cut."""
-    flat = np.stack([result[0] for result in rollout(wrapped(name, observation="flat"), 10)])
+    flat = np.stack([result[0] for result in episode(wrapped(name, observation="flat"), 10)])
     assert (np.abs(flat) == 10.0).mean() < 0.01
     assert 0.1 < np.sqrt(np.mean(flat**2)) < 5
 
 
 def test_meaning_of_the_flat_observation_checked_by_hand():
     scene = SCENES["auv_buoys"]
-    _, full = rollout(wrapped("auv_buoys"), 11, steps=1)
-    _, flat = rollout(wrapped("auv_buoys", observation="flat"), 11, steps=1)
+    _, full = episode(wrapped("auv_buoys"), 11, steps=1)
+    _, flat = episode(wrapped("auv_buoys", observation="flat"), 11, steps=1)
     seen, got = full[0], flat[0]
     rotation, place = seen["belief_rotation"], seen["belief_translation"]
     # Volume +-150, +-150, -80 to -20; anchors +-200 at z = 0: the box around both has the
@@ -315,17 +305,17 @@ def test_coplanar_anchors_are_refused_by_the_linear_filters_where_the_prior_is_v
 
 def test_time_limit_around_it():
     env = TimeLimit(wrapped("uwb_room", observation="flat"), max_episode_steps=5)
-    assert len(rollout(env)) == 6
+    assert len(episode(env)) == 6
 
 
 def test_time_limit_inside_it():
     env = EstimatePose(raw("uwb_room", max_episode_steps=5))
-    assert len(rollout(env)) == 6
+    assert len(episode(env)) == 6
 
 
 def test_episode_statistics_sum_its_reward():
     env = RecordEpisodeStatistics(wrapped(short("drone_yard"), reward="error"))
-    results = rollout(env, 12)
+    results = episode(env, 12)
     told = results[-1][-1]["episode"]
     assert told["l"] == 12
     assert told["r"] == pytest.approx(-sum(r[-1]["tag_error_m"] for r in results[1:]), rel=1e-5)

@@ -15,6 +15,7 @@ from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose
+from tests.side_by_side import episode
 from tests.test_tracking_env import ID
 
 ROOM: dict[str, Any] = {
@@ -180,16 +181,6 @@ def test_too_many_combinations_are_refused():
 # --- environments -----------------------------------------------------------------------------
 
 
-def episode(env, seed):
-    env.action_space.seed(seed)
-    results: list[Any] = [env.reset(seed=seed)]
-    while True:
-        results.append(env.step(env.action_space.sample()))
-        assert env.observation_space.contains(results[-1][0])
-        if results[-1][3]:
-            return results
-
-
 def test_an_episode_equals_that_of_its_scene_alone():
     """The scene is drawn first; what follows is the scene's own episode, in larger arrays."""
     seen = set()
@@ -219,9 +210,9 @@ def test_an_episode_equals_that_of_its_scene_alone():
             assert told["anchor_mask"].sum() == m
             assert told["tag_mask"].sum() == n
             np.testing.assert_array_equal(told["tags"][:n], scene.body)
-            if len(got) == 5:
+            if len(plain) == 5:
                 assert got[1] == plain[1]
-        assert json.loads(results[0][1]["scene"])["name"] == scene.name
+        assert json.loads(results[0][-1]["scene"])["name"] == scene.name
     assert len(seen) > 2
 
 
@@ -239,7 +230,7 @@ def test_a_filter_has_no_more_than_the_scene_alone():
     scene = env.unwrapped.scene  # pyright: ignore[reportAttributeAccessIssue]
     plain = EstimatePose(TrackingEnv(scene, "none"))
     filter = plain._filter
-    info = results[0][1]
+    info = results[0][-1]
     state = filter.initial(
         info["prior_rotation"], info["prior_translation"], info["prior_covariance"]
     )

@@ -15,6 +15,7 @@ from rbl_gym.placement import Context
 from rbl_gym.wrappers import FilterReward, VectorFilterReward
 from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_vector
 from rbl_gym.wrappers.filter_tracks import Tracks, track_error, tracks
+from tests.side_by_side import episode
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -28,15 +29,6 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 def arguments_of(kind: str) -> dict[str, Any]:
     return {"reward": "filter", **WORLDS[kind]}
-
-
-def episode(env, seed):
-    """All steps of an episode of the scalar environment, the reset first."""
-    env.action_space.seed(seed)
-    steps: list[Any] = [env.reset(seed=seed)]
-    while len(steps) == 1 or not steps[-1][2]:
-        steps.append(env.step(env.action_space.sample()))
-    return steps
 
 
 # --- the reward by hand -----------------------------------------------------------------------

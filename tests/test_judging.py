@@ -13,6 +13,7 @@ from rbl_gym.app.reports import compared, print_replay
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests import recorded
 from tests.recorded import CORNERS, STD_M, STD_RAD, curve, honest_track
 
 pytest.importorskip("plotly", reason="needs the extra viz")
@@ -141,8 +142,7 @@ def recorded_run(truth):
     tags = (rotation @ TAGS.T).swapaxes(1, 2) + place[:, None]
     ranges = np.linalg.norm(anchors[:, None] - tags[:, None], axis=-1)
     ranges = ranges + 0.03 * rng.standard_normal(ranges.shape)
-    links, ids = np.ones(ranges.shape, bool), (tuple("abcdef"), tuple("xyz"))
-    return Recording(times, ranges, links, None, anchors, TAGS, *ids, truth)
+    return recorded.recording(times, ranges, anchors, TAGS, truth)
 
 
 def test_an_offset_of_motions_that_hardly_agree_is_doubted():

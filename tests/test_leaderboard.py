@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rbl_gym import estimators, metrics, motion
+from rbl_gym import estimators, metrics
 from rbl_gym.app import bench_report
 from rbl_gym.app.cli import main
 from rbl_gym.estimators import filter as belief
-from rbl_gym.geometry import bodies
-from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Files, read_recording
 from rbl_gym.studies import monte_carlo, replay
 from rbl_gym.studies.bench import figures as bench_figures
@@ -475,13 +473,7 @@ def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys
 @pytest.fixture
 def recording(tmp_path):
     """A log of 41 epochs of a body that turns and drifts, as files and the file that names them."""
-    rng = np.random.default_rng(4)
-    tags = bodies.octahedron(0.8)
-    anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
-    nominal = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], 40)
-    path = motion.simulate(nominal, 0.2, motion.ProcessNoise())
-    ranges = ranging.simulate(anchors, tags, *path, ranging.RangeNoise(0.03), rng).ranges
-    files = recorded.files(tmp_path, anchors, tags, 0.2 * np.arange(41), ranges, path)
+    files = recorded.files(tmp_path, *recorded.walk(41, 4))
     names = "".join(f'{name} = "{name}.csv"\n' for name in files)
     path = tmp_path / "walk.toml"
     path.write_text(f"{names}range_std_m = 0.03\nwalk_m = 0.5\nwalk_deg = 25\n")

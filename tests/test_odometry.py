@@ -20,7 +20,6 @@ from rbl_gym.recordings import (
     Format,
     InertialLog,
     OdometryLog,
-    Recording,
     odometry_between,
     read_odometry,
 )
@@ -28,6 +27,7 @@ from rbl_gym.recordings.tables import Source
 from rbl_gym.recordings.truth import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay import smoothing as replay_smoothing
+from tests import recorded
 from tests.helpers import with_kernels
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "labyrinth_single_tag"
@@ -265,8 +265,7 @@ def a_log(seed=3, K=150, ahead=0.0):
     told[:, [0, 1, 4, 5]] = 0.0
     odometry = OdometryLog(times + 0.5 * dt + ahead, told)
     truth = Truth(times, None, np.array(places), True)
-    return Recording(times, ranges, ranges > 0, None, anchors, np.zeros((1, 3)), tuple("abcd"),
-                     ("0",), truth, odometry=odometry)  # fmt: skip
+    return recorded.recording(times, ranges, anchors, np.zeros((1, 3)), truth, odometry=odometry)
 
 
 SETTINGS = replay.Settings.of(
@@ -387,8 +386,8 @@ def an_inertial_log(ahead=0.0):
     t = np.array([3.0, 2.5, 0.8]) + radius * Q[:, :, 0]
     ranges = ranging.distances(ANCHORS, ranging.tag_positions(Q, t, TAGS))
     ranges = ranges + 0.03 * rng.standard_normal(ranges.shape)
-    return Recording(times, ranges, ranges > 0, None, ANCHORS, TAGS, tuple("abcd"), tuple("01"),
-                     Truth(times, Q, t), inertial=InertialLog(when + ahead, readings))  # fmt: skip
+    log = InertialLog(when + ahead, readings)
+    return recorded.recording(times, ranges, ANCHORS, TAGS, Truth(times, Q, t), inertial=log)
 
 
 INERTIAL = replay.Settings.of(

@@ -15,7 +15,7 @@ from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.placement import Context
 from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_same, is_legal
-from tests.side_by_side import spoil
+from tests.side_by_side import episode, played, spoil
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -40,18 +40,6 @@ def batch_of(env: Any) -> Any:
     return env.unwrapped._batch
 
 
-def episode(env, seed=0):
-    """All steps of an episode of the scalar environment, the reset first."""
-    env.action_space.seed(seed)
-    observation, info = env.reset(seed=seed)
-    steps: list[Any] = [(observation, 0.0, False, False, info)]
-    actions = []
-    while not steps[-1][2]:
-        actions.append(env.action_space.sample())
-        steps.append(env.step(actions[-1]))
-    return steps, actions
-
-
 def context_of(info) -> Context:
     return Context(info["region"][:3], info["region"][3:], info["racks"])
 
@@ -73,7 +61,7 @@ def test_seeds_decide_and_episodes_differ(kind):
     env = AnchorPlacementEnv(**WORLDS[kind])
     first, second = episode(env, 4), episode(env, 4)
     assert_same(first, second)
-    region = first[0][0][-1]["region"]
+    region = first[0][-1]["region"]
     assert (env.reset()[1]["region"] != region).any()
     assert (env.reset(seed=5)[1]["region"] != region).any()
     problem = placement.draw_contexts(batch_of(env).task, np.random.default_rng(4))
@@ -88,7 +76,7 @@ def test_rewards_are_the_score_of_the_anchors_in_info(kind):
     env = AnchorPlacementEnv(**WORLDS[kind])
     task = batch_of(env).task
     for seed in range(3):
-        steps, _ = episode(env, seed)
+        steps = episode(env, seed)
         one_shot = WORLDS[kind].get("mode") == "one-shot"
         assert len(steps) == 1 + (1 if one_shot else task.n_anchors)
         info = steps[-1][4]
@@ -129,7 +117,7 @@ def turned(env, info, mirror):
 def test_sequential_places_each_action_by_the_region(kind, mirror, seed):
     env = AnchorPlacementEnv(**WORLDS[kind], mirror=mirror)
     task = batch_of(env).task
-    steps, actions = episode(env, seed)
+    steps, actions = played(env, seed)
     for k, step in enumerate(steps):
         shown = np.array(actions[:k], float).reshape(-1, 3) * turned(env, step[4], mirror)
         placed = task.scene.anchor_region.place(shown)
@@ -145,7 +133,7 @@ def test_observations_by_hand(kind, mirror, seed):
     task, mode = batch_of(env).task, WORLDS[kind].get("mode", "sequential")
     low, high = (np.array(corner) for corner in (task.scene.volume.low, task.scene.volume.high))
     m = task.n_anchors
-    steps, actions = episode(env, seed)
+    steps, actions = played(env, seed)
     for k, (observation, _, _, _, info) in enumerate(steps):
         assert observation.dtype == np.float32
         assert env.observation_space.contains(observation)

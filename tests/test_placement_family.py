@@ -20,7 +20,7 @@ from rbl_gym.placement.families import TaskFamily, described, task_family
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import FilterReward, VectorFilterReward
 from tests.helpers import is_legal
-from tests.side_by_side import actions_of, assert_steps_alike, peer_of
+from tests.side_by_side import actions_of, assert_steps_alike, episode, peer_of
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 ROOM: dict[str, Any] = {
@@ -47,15 +47,6 @@ WORLDS: dict[str, dict[str, Any]] = {
 every_world = pytest.mark.parametrize("kind", WORLDS)
 
 
-def episode(env, seed):
-    env.action_space.seed(seed)
-    steps: list[Any] = [env.reset(seed=seed)]
-    while len(steps) == 1 or not steps[-1][2]:
-        steps.append(env.step(env.action_space.sample()))
-        assert env.observation_space.contains(steps[-1][0])
-    return steps
-
-
 def task_told(info) -> placement.PlacementTask:
     """The task that the infos of a reset name."""
     told = json.loads(info["scene"])
@@ -69,7 +60,7 @@ def test_the_score_is_that_of_the_task_alone(kind):
     env, seen = PlacementFamilyEnv(**WORLDS[kind]), set()
     for seed in range(16):
         steps = episode(env, seed)
-        one, info = task_told(steps[0][1]), steps[-1][4]
+        one, info = task_told(steps[0][4]), steps[-1][4]
         m, k = one.n_anchors, len(one.scene.obstacles) + one.racks
         seen.add((one.scene.name, m, k))
         assert len(steps) == 1 + (1 if env._batch.mode == "one-shot" else m)

@@ -15,7 +15,7 @@ from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.envs.placement_family import PlacementFamilyEnv, PlacementFamilyVectorEnv
 from rbl_gym.envs.placement_views import PLACEMENT_OBSERVATIONS, Placing, placement_tokens
 from rbl_gym.placement.families import described
-from tests.side_by_side import assert_steps_alike, peer_of
+from tests.side_by_side import assert_steps_alike, episode, peer_of, played
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 ROOM = {
@@ -41,24 +41,13 @@ def distances(placing: Placing) -> dict[str, np.ndarray]:
     return {"gap": gap * told["placed"], "left": told["anchor_mask"] - told["placed"]}
 
 
-def ended(env: gym.Env, seed: int):
-    """Observations and infos of an episode with random actions, and these actions."""
-    env.action_space.seed(seed)
-    steps, actions, over = [env.reset(seed=seed)], [], False
-    while not over:
-        actions.append(env.action_space.sample())
-        observation, _, over, _, info = env.step(actions[-1])
-        steps.append((observation, info))
-    return steps, actions
-
-
 @every_world
 def test_the_dict_without_mirroring_is_what_the_infos_say(kind):
     env = gym.make(ID, observation="dict", mirror=False, **WORLDS[kind])
     for seed in range(4):
-        steps, _ = ended(env, seed)
+        steps = episode(env, seed)
         task: Any = env.get_wrapper_attr("task")
-        for count, (seen, info) in enumerate(steps):
+        for count, (seen, *_, info) in enumerate(steps):
             assert env.observation_space.contains(seen)
             np.testing.assert_array_equal(seen["region"], info["region"])
             np.testing.assert_array_equal(seen["anchors"], info["anchors"])
@@ -83,9 +72,9 @@ def test_what_is_mirrored_agrees_with_the_actions(kind):
     low, high = np.array(low), np.array(high)
     mirrored = 0
     for seed in range(8):
-        steps, actions = ended(env, seed)
-        flat = [one for one, _ in ended(plain, seed)[0]]
-        for (seen, info), vector in zip(steps, flat, strict=True):
+        steps, actions = played(env, seed)
+        flat = [one for one, *_ in episode(plain, seed)]
+        for (seen, *_, info), vector in zip(steps, flat, strict=True):
             signs = np.where(np.isclose(seen["region"][:3], info["region"][:3]), 1, -1)
             mirrored += (signs < 0).any()
             assert (seen["region"][:2] >= (0.5 * (low + high))[:2] - 1e-9).all()
@@ -113,8 +102,8 @@ def test_tokens_by_hand(kind):
     told = gym.make(ID, observation="dict", **WORLDS[kind])
     flat = gym.make(ID, **WORLDS[kind])
     for seed in range(3):
-        for (seen, _), (known, _), (vector, _) in zip(
-            ended(env, seed)[0], ended(told, seed)[0], ended(flat, seed)[0], strict=True
+        for (seen, *_), (known, *_), (vector, *_) in zip(
+            episode(env, seed), episode(told, seed), episode(flat, seed), strict=True
         ):
             assert env.observation_space.contains(seen)
             task: Any = told.get_wrapper_attr("task")

@@ -17,10 +17,11 @@ from rbl_gym.geometry.regions import Box
 from rbl_gym.measurements import ranging
 from rbl_gym.networks import rigidity
 from rbl_gym.placement import design, scene_files
-from rbl_gym.recordings import Recording, Truth
+from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.bench import spec_files, worlds
 from rbl_gym.worlds import scene_bounds, scenes, simulation
+from tests import recorded
 
 TAGS = bodies.pyramid()
 ANCHORS = np.array([[0, 0, 0], [9, 0, 1], [0, 9, 2], [9, 9, 3.0]])
@@ -212,10 +213,7 @@ def test_replays():
         replay.Settings.of(height_offset_m=0.1)
     times = np.arange(3.0)
     truth = Truth(times + 100, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
-    links = np.ones((3, 4, 5), dtype=bool)
-    recording = Recording(
-        times, links * 5.0, links, None, ANCHORS, TAGS, tuple("abcd"), tuple("vwxyz"), truth
-    )
+    recording = recorded.recording(times, np.full((3, 4, 5), 5.0), ANCHORS, TAGS, truth)
     track = replay.Track(times, truth.rotation, truth.translation, np.tile(np.eye(6), (3, 1, 1)))
     with pytest.raises(
         ValueError, match="truth does not overlap with the ranges in time: ranges 0 to 2 s"

@@ -7,11 +7,12 @@ import pytest
 
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings import Recording, Truth
+from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay.centre import about_origin
 from rbl_gym.studies.replay.observed import Observed, observed
 from rbl_gym.studies.replay.place import start_of
+from tests import recorded
 
 ANCHORS = np.array([[0.0, 0, 0], [6, 0, 3], [6, 5, 0], [0, 5, 3], [3, 0, 3], [3, 5, 0.5]])
 
@@ -29,9 +30,8 @@ def record(tags, epochs=60, one_by_one=False, height=1.0, anchors=ANCHORS, seed=
     if one_by_one:
         links = np.arange(links[0].size) == rng.integers(links[0].size, size=(epochs, 1))
         links = links.reshape(exact.shape)
-    ids = tuple(map(str, range(len(anchors)))), tuple(map(str, range(len(tags))))
     truth = Truth(times, turn, place)
-    return Recording(times, ranges * links, links, None, anchors, tags, *ids, truth)
+    return recorded.recording(times, ranges * links, anchors, tags, truth)
 
 
 def outcome(recording, **options):

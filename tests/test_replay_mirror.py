@@ -13,7 +13,7 @@ from rbl_gym import metrics, motion
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings import Recording, Truth
+from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
 from tests import recorded
 from tests.helpers import needs
@@ -36,10 +36,9 @@ def record(anchors, tags, seed=0, epochs=25, noise_m=0.03, start=(1.5, 1.2, 0.8)
     )
     exact = ranging.distances(anchors, ranging.tag_positions(path.rotation, path.translation, tags))
     ranges = exact + noise_m * rng.standard_normal(exact.shape)
-    ids = tuple(map(str, range(len(anchors)))), tuple(map(str, range(len(tags))))
     times = 0.1 * np.arange(epochs)
     truth = Truth(times, path.rotation, path.translation)
-    return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, truth)
+    return recorded.recording(times, ranges, anchors, tags, truth)
 
 
 def outcome(recording, **options):

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import (
-    Recording,
     TrackFile,
     check_track_path,
     read_track,
@@ -125,8 +124,7 @@ def log():
     links = np.ones(ranges.shape, bool)
     links[5], links[6], links[7, 1:] = False, False, False
     links[6, 0, 0] = True
-    return Recording(times, ranges * links, links, None, ANCHORS, TAGS, tuple("abcde"),
-                     tuple("123"), None)  # fmt: skip
+    return recorded.recording(times, ranges * links, ANCHORS, TAGS)
 
 
 def test_ranks_of_epochs_are_those_of_their_jacobians():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import multiprocessing
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +18,7 @@ from rbl_gym import bounds
 from rbl_gym.envs.tracking import TrackingEnv, observation_space
 from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_same, law_by_hand, score_by_hand, share_by_hand
+from tests.side_by_side import episode
 
 ID = "rbl_gym:RBL/Tracking-v0"
 NAMES = list(SCENES)
@@ -32,24 +32,10 @@ OVERRIDDEN = {
     "noise": {"kind": "range", "floor_m": 0.2, "reference_tag": 0},
     "anchors": [[100.0, 0, 0], [0, 100, 0], [0, 0, 100], [-60, -60, -60]],
 }
-Step = tuple[Any, Any, bool, bool, dict[str, Any]]
 
 
 def short(name: str, steps: int = 12, **fields: Any) -> dict[str, Any]:
     return {"name": name, "steps": steps, **fields}
-
-
-def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> Iterator[Step]:
-    """A whole episode under random actions of that seed; the reset comes first."""
-    env.action_space.seed(seed)
-    observation, info = env.reset(seed=seed)
-    yield observation, 0.0, False, False, info
-    for k in range(steps or 10**6):
-        result = env.step(env.action_space.sample())
-        yield result
-        if result[3] and steps is None:
-            break
-        assert k < 10**5
 
 
 # --- Gymnasium --------------------------------------------------------------------------------
@@ -71,13 +57,13 @@ def test_registration_is_idempotent():
 def test_environment_leaves_the_scene_dict_alone():
     scene = copy.deepcopy(OVERRIDDEN)
     env = TrackingEnv(scene)
-    list(rollout(env))
+    episode(env)
     assert scene == OVERRIDDEN
 
 
 def test_max_episode_steps_of_make_truncates():
     env = gym.make(ID, scene="drone_yard", max_episode_steps=7)
-    assert [step[3] for step in rollout(env)] == [False] * 7 + [True]
+    assert [step[3] for step in episode(env)] == [False] * 7 + [True]
 
 
 # --- spaces, memory, types, the end -----------------------------------------------------------
@@ -88,7 +74,7 @@ def test_max_episode_steps_of_make_truncates():
 def test_every_observation_is_in_the_space(name, trajectory):
     fields = {} if trajectory is None else {"trajectory": trajectory}
     env = TrackingEnv(short(name, SCENES[name].steps, links=LOSSY, **fields))
-    for observation, *_ in rollout(env, 8):
+    for observation, *_ in episode(env, 8):
         for key, space in observation_space(env.scene).items():
             assert space.contains(observation[key]), key
         assert env.observation_space.contains(observation)
@@ -123,7 +109,7 @@ def test_fast_spin_stays_in_the_space():
 @pytest.mark.parametrize("name", NAMES)
 def test_episode_truncates_after_the_scenes_steps_and_then_needs_a_reset(name):
     env = TrackingEnv(name)
-    truncated = [step[3] for step in rollout(env)]
+    truncated = [step[3] for step in episode(env)]
     assert truncated == [False] * SCENES[name].steps + [True]
     with pytest.raises(ResetNeeded, match="reset"):
         env.step(env.action_space.sample())
@@ -132,7 +118,7 @@ def test_episode_truncates_after_the_scenes_steps_and_then_needs_a_reset(name):
 
 
 def test_info_tells_the_truth_the_epoch_and_at_reset_the_prior():
-    steps = list(rollout(TrackingEnv(short("uwb_room", 3))))
+    steps = episode(TrackingEnv(short("uwb_room", 3)))
     assert [info["epoch"] for *_, info in steps] == [0, 1, 2, 3]
     common = {"rotation", "translation", "nlos", "epoch", "score_m"}
     prior = {"prior_rotation", "prior_translation", "prior_covariance"}
@@ -147,7 +133,7 @@ def test_ranges_are_those_of_the_true_pose_to_the_anchors_seen(name):
     """Within 6 standard deviations of the distance, the anchors being where they are now."""
     env = TrackingEnv(short(name))
     tags = np.array(env.scene.tags)
-    for observation, *_, info in rollout(env, 11):
+    for observation, *_, info in episode(env, 11):
         for m, n in np.ndindex(observation["ranges"].shape):
             tag = info["rotation"] @ tags[n] + info["translation"]
             distances = np.linalg.norm(
@@ -163,7 +149,7 @@ def test_ranges_are_those_of_the_true_pose_to_the_anchors_seen(name):
 def test_quality_is_that_of_the_sight_from_each_anchor(speed):
     scene = short("hall", 8, anchor_speed_m_s=speed)
     told = []
-    for result in rollout(gym.make(ID, scene=scene), 4):
+    for result in episode(gym.make(ID, scene=scene), 4):
         seen, place = result[0], result[-1]["translation"]
         want = [share_by_hand(SCENES["hall"], anchor, place) for anchor in seen["anchors"]]
         np.testing.assert_array_equal(seen["quality"], want)
@@ -186,7 +172,7 @@ def test_reward_is_minus_log_of_the_posterior_bound_along_the_truth(name, links)
     env = TrackingEnv(short(name, links=links))
     scene, tags = env.scene, np.array(env.scene.tags)
     J = None
-    for k, (seen, reward, *_, info) in enumerate(rollout(env, 12)):
+    for k, (seen, reward, *_, info) in enumerate(episode(env, 12)):
         pose = info["rotation"], info["translation"]
         law = law_by_hand(scene, seen["anchors"], *pose)
         if J is None:
@@ -206,13 +192,13 @@ def test_reward_is_minus_log_of_the_posterior_bound_along_the_truth(name, links)
 
 @pytest.mark.parametrize("name", NAMES)
 def test_reward_none_is_zero_and_computes_no_score(name):
-    steps = list(rollout(TrackingEnv(short(name), reward="none"), 13))
+    steps = episode(TrackingEnv(short(name), reward="none"), 13)
     assert [reward for _, reward, *_ in steps] == [0.0] * 13
     assert not any("score_m" in info for *_, info in steps)
 
 
 def test_reward_has_no_influence_on_the_world():
-    both = [rollout(TrackingEnv(short("satellite"), reward=r), 14) for r in ("bound", "none")]
+    both = [episode(TrackingEnv(short("satellite"), reward=r), 14) for r in ("bound", "none")]
     for a, b in zip(*both, strict=True):
         assert_same(a[0], b[0])
 
@@ -224,7 +210,7 @@ def test_reward_has_no_influence_on_the_world():
 def test_fixed_anchors_have_one_action_and_stay(name):
     env = TrackingEnv(short(name))
     assert env.action_space == spaces.Discrete(1)
-    first, *rest = (observation["anchors"] for observation, *_ in rollout(env, 15))
+    first, *rest = (observation["anchors"] for observation, *_ in episode(env, 15))
     for anchors in rest:
         np.testing.assert_array_equal(anchors, first)
 
@@ -319,7 +305,7 @@ def test_bad_render_mode_is_named():
 @pytest.mark.parametrize("name", NAMES)
 def test_lost_links_show_as_range_0_and_as_often_as_said(name):
     env = TrackingEnv({"name": name, "steps": 40, "links": {"drop_probability": 0.25}})
-    seen = [observation for observation, *_ in rollout(env, 20)]
+    seen = [observation for observation, *_ in episode(env, 20)]
     ranges = np.stack([observation["ranges"] for observation in seen])
     links = np.stack([observation["links"] for observation in seen])
     np.testing.assert_array_equal(ranges == 0, links == 0)
@@ -329,11 +315,11 @@ def test_lost_links_show_as_range_0_and_as_often_as_said(name):
 
 def test_info_marks_reflected_paths():
     env = TrackingEnv(short("uwb_room", links={"nlos_probability": 0.3, "nlos_bias_m": 50.0}))
-    for observation, *_, info in rollout(env, 21):
+    for observation, *_, info in episode(env, 21):
         np.testing.assert_array_equal(info["nlos"], observation["ranges"] > 40)
 
 
 def test_no_link_at_all_is_a_world_too():
     env = TrackingEnv(short("auv_buoys", links={"drop_probability": 1.0}))
-    scores = [info["score_m"] for *_, info in rollout(env, 22)]
+    scores = [info["score_m"] for *_, info in episode(env, 22)]
     assert (np.diff(scores) > 0).all()
