@@ -154,7 +154,7 @@ def settle_labels(figure: Any, groups: list[tuple[Any, list[Any]]]) -> None:
 
 def draw_map(axes: Any, shown: list[shapes.Layer], quantity: shapes.Quantity) -> None:
     """Draw accuracy over the zones with a colour bar; hatched where a limit is exceeded."""
-    limits = [getattr(layer.zone, str(quantity.limit), None) for layer in shown]
+    limits = [quantity.limit_of(layer.zone) for layer in shown]
     given = [limit for limit in limits if limit is not None]
     low, high = shapes.colour_range(shown, max(given, default=None))
     image, beyond = None, False

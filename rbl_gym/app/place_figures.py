@@ -113,8 +113,7 @@ def map_panel(
         levels = sorted({f"{one.at:.3g}" for one in maps}, key=float)
         at = levels[0] if len(levels) == 1 else f"{levels[0]} to {levels[-1]}"
         limited = any(
-            (layer.values > (getattr(layer.zone, str(quantity.limit), None) or np.inf)).any()
-            for layer in shown
+            (layer.values > (quantity.limit_of(layer.zone) or np.inf)).any() for layer in shown
         )
         title = f"error of {quantity.name} at z = {at} m{case}"
         axes.set_title(title + (f"{between}hatched: beyond the requirement" if limited else ""))

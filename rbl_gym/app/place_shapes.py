@@ -11,9 +11,10 @@ from scipy import ndimage
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.polygons import contains
+from rbl_gym.geometry.obstacles import box_bounds
+from rbl_gym.geometry.polygons import contains, rectangle
 from rbl_gym.geometry.regions import Shell
-from rbl_gym.placement.scene_files import Problem
+from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.placing.accuracy import Map, accuracy_map
 from rbl_gym.studies.placing.judging import limits_of
 
@@ -37,6 +38,10 @@ class Quantity(NamedTuple):
     unit: str
     limit: str | None
 
+    def limit_of(self, zone: Zone) -> float | None:
+        """Return the limit that a zone requires; None without one."""
+        return getattr(zone, self.limit) if self.limit else None
+
 
 _ASKED = (
     Quantity("horizontal", "horizontal position", "m", "position_m"),
@@ -51,7 +56,7 @@ _PLAIN = (
 
 def quantities(problem: Problem) -> list[Quantity]:
     """Return the quantities to map: the required ones, otherwise position and orientation."""
-    asked = {q.field for q in _ASKED for z in problem.zones if getattr(z, str(q.limit)) is not None}
+    asked = {q.field for q in _ASKED for z in problem.zones if q.limit_of(z) is not None}
     if not asked and all(zone.attitude == "free" for zone in problem.zones):
         return list(_PLAIN)
     found = [q for q in _ASKED if q.field in asked]
@@ -75,11 +80,10 @@ class Solid(NamedTuple):
 def solids(problem: Problem) -> list[Solid]:
     """Return all obstacles, the lowest first."""
     obstacles = problem.obstacles
-    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    common = obstacles.blocked_information
+    common, (lows, highs) = obstacles.blocked_information, box_bounds(obstacles.boxes)
     found = [
-        Solid(box[:2] + turns * box[3:5], box[2] - box[5], box[2] + box[5], common)
-        for box in obstacles.boxes
+        Solid(rectangle(low, high), low[2], high[2], common)
+        for low, high in zip(lows, highs, strict=True)
     ]
     prisms = obstacles.prisms
     for corners, low, high, share in zip(
@@ -215,11 +219,8 @@ def values_of(zone: Any, one: Map, field: str) -> FloatArray:
     """Return values (rows, columns) of a map; NaN off the zone, in obstacles, without limits."""
     if field != "relative":
         return getattr(one, field)
-    ratios = [
-        getattr(one, q.field) / getattr(zone, str(q.limit))
-        for q in _ASKED
-        if getattr(zone, str(q.limit)) is not None
-    ]
+    limits = [(q.field, q.limit_of(zone)) for q in _ASKED]
+    ratios = [getattr(one, name) / limit for name, limit in limits if limit is not None]
     return np.max(ratios, axis=0) if ratios else np.full(one.position.shape, np.nan)
 
 

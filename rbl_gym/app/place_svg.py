@@ -220,7 +220,7 @@ def _controls(panels: list[shapes.Quantity], levels: Any) -> str:
 
 
 def _limit(problem: Any, quantity: shapes.Quantity) -> float | None:
-    limits = [getattr(zone, str(quantity.limit), None) for zone in problem.zones]
+    limits = [quantity.limit_of(zone) for zone in problem.zones]
     return max((limit for limit in limits if limit is not None), default=None)
 
 
@@ -245,7 +245,7 @@ def _images(
         share = np.clip((layer.values - span[0]) / (span[1] - span[0]), 0, 1)
         image = (255 * colormaps[COLOURS](np.nan_to_num(share))[..., :3]).astype(np.uint8)
         parts.append(draw.image(_uri(_picture(image)), box, clip))
-        limit = getattr(layer.zone, str(quantity.limit), None)
+        limit = quantity.limit_of(layer.zone)
         if limit is not None and (layer.values > limit).any():
             beyond = _zoomed(layer.values) > limit
             stripes = np.zeros((*beyond.shape, 4), np.uint8)

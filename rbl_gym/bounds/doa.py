@@ -60,7 +60,6 @@ def doa_crb(
     translation: ArrayLike,
     noise: bearing.AngleNoise,
     prior_information: ArrayLike | None = None,
-    station: ArrayLike | None = None,
 ) -> FloatArray:
     """Return the constrained Cramer-Rao bound (..., 6, 6) of the pose from directions of arrival.
 
@@ -73,7 +72,7 @@ def doa_crb(
     ValueError
         As in `doa_information`, and if the information is singular; the message gives its rank.
     """
-    information = doa_information(tags, rotation, translation, noise, station)
+    information = doa_information(tags, rotation, translation, noise)
     if prior_information is not None:
         information = information + check_array("prior_information", prior_information, (6, 6))
     return bounds.inverted(information, "tags")

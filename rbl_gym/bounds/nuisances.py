@@ -229,8 +229,8 @@ def with_epoch(J: FloatArray, told: FloatArray, states: int) -> FloatArray:
     return result
 
 
-def marginal_information(joint: ArrayLike, states: int = 6) -> FloatArray:
-    """Return the information (..., n, n) on the first `states`: the Schur complement.
+def marginal_information(joint: ArrayLike) -> FloatArray:
+    """Return the information (..., 6, 6) on the pose, the first six states: the Schur complement.
 
     Raises
     ------
@@ -238,15 +238,13 @@ def marginal_information(joint: ArrayLike, states: int = 6) -> FloatArray:
         If the matrix is not square, has fewer states, or is singular in the other states.
     """
     joint = check_array("joint", joint, ("n", "n"))
-    if joint.shape[-1] != joint.shape[-2] or joint.shape[-1] < states:
-        raise ValueError(
-            f"joint must have shape (..., {states} + q, {states} + q), got {joint.shape}"
-        )
+    if joint.shape[-1] != joint.shape[-2] or joint.shape[-1] < 6:
+        raise ValueError(f"joint must have shape (..., 6 + q, 6 + q), got {joint.shape}")
     try:
         with np.errstate(all="ignore"):
-            found = fisher.marginal(joint, states)
+            found = fisher.marginal(joint, 6)
     except np.linalg.LinAlgError:
-        found = np.full((states, states), np.nan)
+        found = np.full((6, 6), np.nan)
     if not np.isfinite(found).all():
         raise ValueError(
             f"joint must be an information matrix (positive semidefinite), got {joint!r:.80}"

@@ -73,18 +73,22 @@ def inverted(information: FloatArray, more: str) -> FloatArray:
     return np.linalg.inv(information)
 
 
-def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:
+# Eigenvalues of information below this do not count, with the diagonal scaled to one.
+_RANK_TOLERANCE = 1e-11
+
+
+def information_rank(information: FloatArray) -> np.ndarray:
     """Return the number (...) of directions determined by information (..., n, n); unit-free."""
     n = information.shape[-1]
     # With a unit diagonal no eigenvalue exceeds n. The determinant then bounds the smallest one,
     # so that most matrices need no eigenvalues.
-    _, regular = regular_inverse(information, 2 * tolerance * n ** (n - 1))
+    _, regular = regular_inverse(information, 2 * _RANK_TOLERANCE * n ** (n - 1))
     rank, open_ = np.full(information.shape[:-2], n), ~np.asarray(regular)
     if open_.any():
         scale = np.sqrt(np.maximum(np.diagonal(information[open_], axis1=-2, axis2=-1), 0.0))
         scale = np.where(scale > 0, scale, 1.0)
         scaled = information[open_] / (scale[..., :, None] * scale[..., None, :])
-        rank[open_] = (np.linalg.eigvalsh(scaled) > tolerance).sum(axis=-1)
+        rank[open_] = (np.linalg.eigvalsh(scaled) > _RANK_TOLERANCE).sum(axis=-1)
     return rank
 
 

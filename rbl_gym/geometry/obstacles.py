@@ -18,7 +18,7 @@ from rbl_gym.geometry.plan_grid import PlanGrid, one_cell, plan_grid
 from rbl_gym.geometry.polygons import TOUCH_M, check_polygon, contains
 from rbl_gym.kernels import compiled
 
-__all__ = ["Obstacles", "Prisms", "held_by", "in_sight", "inside", "share_behind"]
+__all__ = ["Obstacles", "Prisms", "box_bounds", "held_by", "in_sight", "inside", "share_behind"]
 
 # A path inside a prism up to this length only touches it, metres: links begin at its faces.
 _LEAST_WAY_M = 1e-6
@@ -26,6 +26,12 @@ _LEAST_WAY_M = 1e-6
 _MANY_BOXES, _MANY = 64, 12
 # A link with a smaller length in the plan is vertical, metres.
 _VERTICAL_M = 1e-12
+
+
+def box_bounds(boxes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and the highest corners (..., 3) of boxes (..., 6), metres."""
+    centre, half = boxes[..., :3], boxes[..., 3:]
+    return centre - half, centre + half
 
 
 @dataclass(frozen=True, eq=False)

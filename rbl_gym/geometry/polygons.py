@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array
 
-__all__ = ["area", "check_line", "check_polygon", "contains", "ears"]
+__all__ = ["area", "check_line", "check_polygon", "contains", "ears", "rectangle"]
 
 # Corners closer than this are identical, and lines closer than this touch, metres.
 TOUCH_M = 1e-9
@@ -20,6 +20,12 @@ def area(polygon: FloatArray) -> float:
     # Relative to the first corner: far from the origin the products lose digits.
     x, y = (polygon - polygon[0]).T
     return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return corners (..., 4, 2) of boxes in plan, counter-clockwise; x and y of (..., 2 or 3)."""
+    ends = np.stack([low, high], axis=-2)
+    return np.stack([ends[..., [0, 1, 1, 0], 0], ends[..., [0, 0, 1, 1], 1]], axis=-1)
 
 
 def check_line(name: str, line: ArrayLike, closed: bool = False) -> FloatArray:

@@ -31,6 +31,8 @@ _TOGETHER = 6
 _SCREEN, _SCREENED = 512, 6
 # Standard deviations of fresh candidates around an anchor: fractions of the largest extent.
 _SPREADS = np.array([0.005, 0.02, 0.05, 0.15])
+# Number of fresh candidates with each of these deviations, and of those from the whole region.
+_EACH = 8
 # Anchors closer to each other than this coincide, metres.
 _APART_M = 1e-3
 # Upper half of a 6 x 6 matrix, and the multiplicity of its entries in a product.
@@ -127,7 +129,7 @@ def _square_and_slope(spread: FloatArray, information: FloatArray) -> tuple[Floa
 
 
 def refresh(
-    setting: Setting, anchors: FloatArray, rng: np.random.Generator, each: int = 8
+    setting: Setting, anchors: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, float]:
     """Do one round of fresh candidates: each anchor moves to its best one if that helps.
 
@@ -138,18 +140,15 @@ def refresh(
     anchors
         (M, 3), metres.
     rng
-        Draws the candidates.
-    each
-        Number of candidates at each of several distances from the anchor, and number of
-        candidates from the whole region. They are projected onto the region, so that those near
-        an edge may lie on the adjacent face.
+        Draws the candidates. They are projected onto the region, so that those near an edge may
+        lie on the adjacent face.
 
     Returns
     -------
     The layout and its score.
     """
     anchors, region, sample = anchors.copy(), setting.region, setting.sample
-    spreads = np.repeat(_SPREADS * float(np.ptp(region.bounds(), axis=0).max()), each)
+    spreads = np.repeat(_SPREADS * float(np.ptp(region.bounds(), axis=0).max()), _EACH)
     parts = setting.parts(anchors)
     total = sample.prior + parts.sum(axis=0)
     least = float(setting.squares(total))
@@ -158,7 +157,7 @@ def refresh(
     parts_of_sample = [(index, setting.part(index)) for index in indices]
     for m in rng.permutation(len(anchors)):
         near = anchors[m] + spreads[:, None] * rng.standard_normal((len(spreads), 3))
-        fresh = np.concatenate([region.project(near), region.draw(rng.random((each, 3)))])
+        fresh = np.concatenate([region.project(near), region.draw(rng.random((_EACH, 3)))])
         fresh = fresh[~setting.obstacles.contain(fresh)]
         apart = np.abs(fresh[:, None] - np.delete(anchors, m, axis=0)).max(axis=-1)
         fresh = fresh[(apart > _APART_M).all(axis=-1)]

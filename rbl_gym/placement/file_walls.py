@@ -10,7 +10,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, did_you_mean
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
-from rbl_gym.geometry.polygons import TOUCH_M, check_polygon
+from rbl_gym.geometry.polygons import TOUCH_M, check_polygon, rectangle
 from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.mounting import Mount
 
@@ -119,11 +119,6 @@ def _check_rises(name: str, table: Mapping[str, Any]) -> None:
         raise ValueError(
             f"{name}: low_m must lie below high_m, got {table['low_m']:g} and {table['high_m']:g}"
         )
-
-
-def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return corners (4, 2) of a box in plan, counter-clockwise."""
-    return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
 
 
 def segments(line: FloatArray, closed: bool) -> list[tuple[FloatArray, FloatArray]]:

@@ -13,7 +13,8 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.extras import require
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.obstacles import Obstacles, Prisms
+from rbl_gym.geometry.obstacles import Obstacles, Prisms, box_bounds
+from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.geometry.regions import Faces
 
 # An obstacle this close in front of a face covers it, metres.
@@ -96,11 +97,9 @@ class _Solids(NamedTuple):
 
 def _prisms_of(obstacles: Obstacles) -> Prisms:
     """Return all obstacles as prisms."""
-    centre, half = obstacles.boxes[:, :3], obstacles.boxes[:, 3:]
-    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    rings = [*(centre[:, None, :2] + turns * half[:, None, :2]), *obstacles.prisms.corners]
-    low = [*(centre - half)[:, 2], *obstacles.prisms.low_m]
-    return Prisms.packed(rings, low, [*(centre + half)[:, 2], *obstacles.prisms.high_m])
+    (low, high), prisms = box_bounds(obstacles.boxes), obstacles.prisms
+    rings = [*rectangle(low, high), *prisms.corners]
+    return Prisms.packed(rings, [*low[:, 2], *prisms.low_m], [*high[:, 2], *prisms.high_m])
 
 
 def _solids(shapely: Any, prisms: Prisms, grown: float) -> _Solids:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import placement
 from rbl_gym.checks import FloatArray, as_tuples, check_array, check_number, did_you_mean
 from rbl_gym.geometry.obstacles import Obstacles, Prisms, inside
+from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import NOISE_LAWS, NoiseLaw
@@ -28,7 +29,7 @@ from rbl_gym.placement.file_checks import check_numbers, check_problem
 from rbl_gym.placement.file_keys import BODIES, FORMAT, MAX_ANCHORS, MIN_ANCHORS
 from rbl_gym.placement.file_lines import line_of
 from rbl_gym.placement.file_tables import as_table, check_text, read_table
-from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, rectangle, show
+from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, show
 from rbl_gym.placement.mounting import cut_mounts
 from rbl_gym.placement.outline import outside
 from rbl_gym.worlds import scenes

@@ -28,6 +28,8 @@ __all__ = [
 _DRAWN = 150
 # Candidates of a greedy start, rounds of fresh ones after them, and then gradient steps.
 _CANDIDATES, _ROUNDS, _STEPS = 100, 3, 12
+# Initial standard deviation of CMA-ES, in the action box [-1, 1].
+_SIGMA = 0.6
 # Hybrid search: greedy starts, turns of fresh candidates and gradient, steps of each turn.
 _STARTS, _TURNS, _STEPS_OF_TURN = 2, 2, 20
 
@@ -201,7 +203,6 @@ def cma_es(
     rng: np.random.Generator,
     generations: int = 120,
     population: int = 16,
-    sigma: float = 0.6,
     start: FloatArray | None = None,
 ) -> FloatArray:
     """Run CMA-ES on the actions of all anchors, separately for each context.
@@ -212,8 +213,6 @@ def cma_es(
         The problem, contexts (...), and the source of all random numbers.
     generations, population
         Their product is the number of layouts scored for each context.
-    sigma
-        Initial standard deviation, in the action box [-1, 1].
     start
         Anchors (..., M, 3) to start from, for example those of a policy; None: near the centre.
 
@@ -234,7 +233,7 @@ def cma_es(
         mean = np.broadcast_to(task.scene.anchor_region.action(begin), (*batch, *begin.shape[-2:]))
         mean = mean.reshape((*batch, size))
     flat = mean.reshape(-1, size)
-    strategies = [_strategy(one, sigma, population, rng) for one in flat]
+    strategies = [_strategy(one, population, rng) for one in flat]
     best = flat.copy()
     best_score = _scores(task, context, best.reshape((*batch, size))).reshape(-1)
     for _ in range(generations):
@@ -258,7 +257,6 @@ def shared_layout(
     rng: np.random.Generator,
     generations: int = 120,
     population: int = 16,
-    sigma: float = 0.6,
 ) -> FloatArray:
     """Return one layout (M, 3) for all contexts (C,): CMA-ES on the mean log score.
 
@@ -267,7 +265,7 @@ def shared_layout(
     if contexts.centre.ndim != 2:
         raise ValueError(f"contexts must have one batch axis, got {contexts.centre.shape[:-1]}")
     size = 3 * task.n_anchors
-    strategy = _strategy(0.1 * rng.standard_normal(size), sigma, population, rng)
+    strategy = _strategy(0.1 * rng.standard_normal(size), population, rng)
     best, best_value = np.zeros(size), math.inf
     for _ in range(generations):
         asked = np.array([strategy.ask() for _ in range(population)])
@@ -278,12 +276,12 @@ def shared_layout(
     return _placed(task, best)
 
 
-def _strategy(mean: FloatArray, sigma: float, population: int, rng: np.random.Generator) -> Any:
+def _strategy(mean: FloatArray, population: int, rng: np.random.Generator) -> Any:
     require("cmaes", "placement", "the reference cma-es")
     from cmaes import CMA
 
     seed = int(rng.integers(2**31))
-    return CMA(mean=mean, sigma=sigma, population_size=population, seed=seed)
+    return CMA(mean=mean, sigma=_SIGMA, population_size=population, seed=seed)
 
 
 def _placed(task: PlacementTask, actions: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from rbl_gym.geometry.obstacles import Prisms
 Image = NDArray[np.uint8]
 # Colours of truth, belief and bound, anchors, error, obstacles.
 INK, BELIEF, ANCHOR, ERROR, OBSTACLE = "#222222", "#1b7f5c", "#d1495b", "#2e86ab", "#6c757d"
+OBSTACLES: dict[str, Any] = {"fc": OBSTACLE, "ec": "#495057", "lw": 0.5}
 AXES = ("#c0392b", "#27964f", "#2f5fb3")  # of a body: x, y, z
 _DPI = 100
 _ELEVATION, _AZIMUTH = 24.0, -58.0  # view direction of 3-D space, degrees
@@ -67,28 +68,31 @@ class Panel:
     def line(self, axes: Any = None, **style: Any) -> Any:
         """Return a moving line, in data coordinates of some axes or in pixels of the panel."""
         from matplotlib.lines import Line2D
-        from matplotlib.transforms import IdentityTransform
 
-        transform = IdentityTransform() if axes is None else axes.transData
-        line = Line2D([], [], transform=transform, animated=True, **style)
-        self.figure.add_artist(line)
-        if axes is not None:
-            line.set_clip_path(axes.patch)
-        return line
+        return self._moving(Line2D([], [], **style), axes)
 
     def patch(self, axes: Any = None, **style: Any) -> Any:
         """Return a moving polygon, as `line`."""
         from matplotlib.patches import Polygon
+
+        return self._moving(Polygon(np.zeros((1, 2)), closed=True, **style), axes)
+
+    def obstacles(self, faces: Iterable[FloatArray], alpha: float, axes: Any = None) -> None:
+        """Add polygons (V, 2) of obstacles to the static part, as `line`."""
+        for face in faces:
+            patch = self.patch(axes, alpha=alpha, **OBSTACLES)
+            patch.set_xy(face)
+            patch.set_animated(False)
+
+    def _moving(self, artist: Any, axes: Any) -> Any:
         from matplotlib.transforms import IdentityTransform
 
-        transform = IdentityTransform() if axes is None else axes.transData
-        polygon = Polygon(
-            np.zeros((1, 2)), closed=True, transform=transform, animated=True, **style
-        )
-        self.figure.add_artist(polygon)
+        artist.set_transform(IdentityTransform() if axes is None else axes.transData)
+        artist.set_animated(True)
+        self.figure.add_artist(artist)
         if axes is not None:
-            polygon.set_clip_path(axes.patch)
-        return polygon
+            artist.set_clip_path(axes.patch)
+        return artist
 
 
 def write(picture: Image, row: int, column: int, text: str, colour: str = "#495057") -> None:
@@ -115,6 +119,22 @@ def _glyph(character: str, colour: str) -> Image:
     picture = np.empty((16, 40, 3), dtype=np.uint8)
     panel.paint([], picture)
     return picture[:, :width]
+
+
+def plan_axes(
+    panel: Panel, area: tuple[float, float, float, float], low: FloatArray, high: FloatArray
+) -> Any:
+    """Return axes of a plan between two corners. `area`: left, bottom, width, height, to 1."""
+    axes: Any = panel.figure.add_axes(area)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlabel("x [m]", fontsize=8, labelpad=1)
+    axes.set_ylabel("y [m]", fontsize=8, labelpad=1)
+    axes.tick_params(labelsize=7, length=2.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.3, lw=0.5)
+    return axes
 
 
 class View:

@@ -13,7 +13,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import panels
 from rbl_gym.rendering.body import limits_of
-from rbl_gym.rendering.drawing import BELIEF, INK, Image, Panel, gapped, write
+from rbl_gym.rendering.drawing import BELIEF, INK, Image, Panel, gapped, plan_axes, write
 from rbl_gym.rendering.film import Film, check_mode, mapped
 
 _LENGTH = 0.055  # length of a heading, relative to the square's side
@@ -101,16 +101,8 @@ class _Plan:
 
     def __init__(self, side_m: float, n_nodes: int) -> None:
         self.panel = panel = Panel(panels.LEFT, panels.HEIGHT)
-        axes: Any = panel.figure.add_axes((0.085, 0.075, 0.84, 0.8))
-        margin = 0.12 * side_m
-        axes.set_xlim(-margin, side_m + margin)
-        axes.set_ylim(-margin, side_m + margin)
-        axes.set_aspect("equal", adjustable="box")
-        axes.set_xlabel("x [m]", fontsize=8, labelpad=1)
-        axes.set_ylabel("y [m]", fontsize=8, labelpad=1)
-        axes.tick_params(labelsize=7, length=2.5)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.3, lw=0.5)
+        margin = np.full(2, 0.12 * side_m)
+        axes = plan_axes(panel, (0.085, 0.075, 0.84, 0.8), -margin, side_m + margin)
         panel.figure.text(0.025, 0.955, "planar network", fontsize=12, weight="bold", color=INK)
         panel.freeze()
         self._length = _LENGTH * side_m

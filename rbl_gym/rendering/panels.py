@@ -11,13 +11,13 @@ import numpy as np
 from rbl_gym import metrics
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
+from rbl_gym.geometry.obstacles import box_bounds
 from rbl_gym.rendering.drawing import (
     ANCHOR,
     AXES,
     BELIEF,
     ERROR,
     INK,
-    OBSTACLE,
     RADIUS_95,
     Image,
     Panel,
@@ -54,14 +54,8 @@ class _World:
         self._floor = min(stage.low[2], stage.high[2])
         self._length = 0.07 * float(np.max(np.subtract(stage.high, stage.low)))
         for box in np.asarray(stage.obstacles, float).reshape(-1, 6):
-            for face in view(box_faces(box[:3] - box[3:], box[:3] + box[3:])):
-                patch = panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
-                patch.set_xy(face)
-                patch.set_animated(False)
-        for wall in view(prism_faces(stage.prisms)):
-            patch = panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
-            patch.set_xy(wall)
-            patch.set_animated(False)
+            panel.obstacles(view(box_faces(*box_bounds(box))), 0.35)
+        panel.obstacles(view(prism_faces(stage.prisms)), 0.35)
         panel.freeze()
         self._shadow = panel.line(color="#c3c9ce", lw=1.2)
         self._stems = panel.line(color="#b4bac0", lw=0.7, ls=(0, (2, 2)))

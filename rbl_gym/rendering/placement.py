@@ -10,18 +10,21 @@ import numpy as np
 
 from rbl_gym import bounds, placement
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import box_bounds
+from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.rendering import panels
 from rbl_gym.rendering.body import limits_of
 from rbl_gym.rendering.drawing import (
     ANCHOR,
     INK,
-    OBSTACLE,
+    OBSTACLES,
     Image,
     Panel,
     box_edges,
     box_faces,
     gapped,
+    plan_axes,
     prism_faces,
     space,
     view_of,
@@ -142,15 +145,9 @@ class _World:
                           ha="center", color="#495057")  # fmt: skip
         panel.freeze()
         self._view, self._floor = view_of(axes), low[2]
-        for wall in self._view(prism_faces(task.scene.prisms)):
-            patch = panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
-            patch.set_xy(wall)
-            patch.set_animated(False)
+        panel.obstacles(self._view(prism_faces(task.scene.prisms)), 0.35)
         panel.freeze()
-        self._racks = [
-            panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
-            for _ in range(6 * _boxes(task))
-        ]
+        self._racks = [panel.patch(alpha=0.35, **OBSTACLES) for _ in range(6 * _boxes(task))]
         self._stems = panel.line(color="#b4bac0", lw=0.8, ls=(0, (2, 2)))
         self._region = panel.line(color=INK, lw=1.1, ls=(0, (4, 2)))
         self._points = _Points(panel)
@@ -174,11 +171,7 @@ class _World:
         self._region.set_data(*gapped(view(box_edges(low, high))).T)
         self._points.set(view(places), errors)
         self._anchors.set_data(*view(anchors).T)
-        faces = [
-            face
-            for box in context.racks
-            for face in view(box_faces(box[:3] - box[3:], box[:3] + box[3:]))
-        ]
+        faces = [face for box in context.racks for face in view(box_faces(*box_bounds(box)))]
         for patch, face in zip(self._racks, faces, strict=False):
             patch.set_xy(face)
         artists = [*self._racks[: len(faces)], self._stems, self._region, *self._points.lines]
@@ -192,25 +185,11 @@ class _Plan:
     def __init__(self, task: PlacementTask) -> None:
         low, high = _corners(task)
         self.panel = panel = Panel(panels.WIDTH - panels.LEFT, panels.TOP)
-        axes: Any = panel.figure.add_axes((0.145, 0.145, 0.825, 0.82))
         margin = 0.05 * (high - low).max()
-        axes.set_xlim(low[0] - margin, high[0] + margin)
-        axes.set_ylim(low[1] - margin, high[1] + margin)
-        axes.set_aspect("equal", adjustable="box")
-        axes.set_xlabel("x [m]", fontsize=8, labelpad=1)
-        axes.set_ylabel("y [m]", fontsize=8)
-        axes.tick_params(labelsize=7, length=2.5)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.3, lw=0.5)
-        for corners in task.scene.prisms.corners:
-            patch = panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
-            patch.set_xy(corners)
-            patch.set_animated(False)
+        axes = plan_axes(panel, (0.145, 0.145, 0.825, 0.82), low - margin, high + margin)
+        panel.obstacles(task.scene.prisms.corners, 0.5, axes)
         panel.freeze()
-        self._racks = [
-            panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
-            for _ in range(_boxes(task))
-        ]
+        self._racks = [panel.patch(axes, alpha=0.5, **OBSTACLES) for _ in range(_boxes(task))]
         self._region = panel.line(axes, color=INK, lw=1.1, ls=(0, (4, 2)))
         self._points = _Points(panel, axes)
         style = {"ls": "", "mec": "white", "mew": 0.8}
@@ -227,13 +206,12 @@ class _Plan:
         picture: Image,
     ) -> None:
         """Draw as `_World.paint`, with the numbers of the anchors."""
-        around = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-        region = context.centre[:2] + around * context.half[:2]
-        self._region.set_data(*region.T)
+        low, high = context.centre - context.half, context.centre + context.half
+        self._region.set_data(*rectangle(low, high)[[0, 1, 2, 3, 0]].T)
         self._points.set(places[:, :2], errors)
         self._anchors.set_data(*anchors[:, :2].T)
-        for patch, box in zip(self._racks, context.racks, strict=False):
-            patch.set_xy(box[:2] + around * box[3:5])
+        for patch, ring in zip(self._racks, rectangle(*box_bounds(context.racks)), strict=False):
+            patch.set_xy(ring)
         artists = [*self._racks[: len(context.racks)], self._region, *self._points.lines]
         self.panel.paint([*artists, self._anchors], picture)
         for k, (x, y) in enumerate(self._pixels.transform(anchors[:, :2])):

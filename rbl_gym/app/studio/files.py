@@ -20,6 +20,7 @@ import numpy as np
 from rbl_gym.app.studio.state import State, open_state
 from rbl_gym.app.studio.world import knobs_of, noise_field
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import box_bounds
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.noise_laws import NOISE_LAWS
 from rbl_gym.placement import scene_files
@@ -227,7 +228,8 @@ def tables_of(problem: Problem) -> dict[str, Any]:
         "anchors": {"kind": kinds[type(mounts)]} | {k: _plain(v) for k, v in fields.items()},
         "zones": [_zone_table(zone) for zone in problem.zones],
         "obstacles": [
-            {"low": _plain(box[:3] - box[3:]), "high": _plain(box[:3] + box[3:])} for box in boxes
+            {"low": _plain(low), "high": _plain(high)}
+            for low, high in zip(*box_bounds(boxes), strict=True)
         ],
         "body": {"tags": problem.tags.tolist()},
         "noise": {"kind": law}

@@ -11,9 +11,11 @@ import numpy as np
 from rbl_gym.app.place_shapes import solids
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.polygons import prism_edges, prism_mesh
+from rbl_gym.geometry.obstacles import box_bounds
+from rbl_gym.geometry.polygons import prism_mesh, rectangle
 from rbl_gym.geometry.regions import Shell, Walls
 from rbl_gym.placement.building import Problem
+from rbl_gym.rendering.drawing import box_edges
 
 # Width of the panel, pixels.
 PANEL = 310
@@ -33,8 +35,8 @@ def corners(problem: Problem) -> tuple[FloatArray, FloatArray]:
     low, high = np.min(lows, axis=0), np.max(highs, axis=0)
     boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
     if len(boxes):
-        low = np.minimum(low, (boxes[:, :3] - boxes[:, 3:]).min(axis=0))
-        high = np.maximum(high, (boxes[:, :3] + boxes[:, 3:]).max(axis=0))
+        lows, highs = box_bounds(boxes)
+        low, high = np.minimum(low, lows.min(axis=0)), np.maximum(high, highs.max(axis=0))
     if len(prisms):
         plan = prisms.corners.reshape(-1, 2)
         low = np.minimum(low, [*plan.min(axis=0), prisms.low_m.min()])
@@ -146,8 +148,7 @@ def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None)
 def _draw_floor(scene: Any, low: FloatArray, high: FloatArray, opacity: float | None) -> None:
     """Draw a floor with a grid of whole metres, below everything else."""
     extent = float((high - low).max())
-    flat = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    floor = np.column_stack([flat, np.full(4, low[2] - 0.002 * extent)])
+    floor = np.column_stack([rectangle(low, high), np.full(4, low[2] - 0.002 * extent)])
     scene.add_mesh_simple(
         "/room/floor", floor, np.array([[0, 1, 2], [0, 2, 3]]), color=FLOOR, side="double",
         opacity=opacity, cast_shadow=False, receive_shadow=False,
@@ -182,12 +183,6 @@ def _grid(low: FloatArray, high: FloatArray, step: float, z: float) -> FloatArra
             ends[:, axis] = at
             found.append(ends)
     return np.array(found).reshape(-1, 2, 3)
-
-
-def box_edges(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the twelve edges (12, 2, 3) of a box."""
-    ring = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    return prism_edges(ring, low[2], high[2])
 
 
 def _room_faces(low: FloatArray, high: FloatArray) -> tuple[FloatArray, np.ndarray]:

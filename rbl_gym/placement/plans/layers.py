@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.checks import did_you_mean
-from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.geometry.polygons import area, contains, rectangle
 from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.plans.drawing import Drawing, Shape
 from rbl_gym.placement.plans.pairs import centre_lines
@@ -20,7 +20,6 @@ from rbl_gym.placement.plans.parts import (
     lines_of,
     outline_of,
     points_of,
-    rectangle,
     rounded,
     spots_of,
 )
@@ -349,7 +348,7 @@ class _Maker:
         low, high = self.drawing._replace(
             shapes=[s for s in self.drawing.shapes if s.layer in self.used or not self.used]
         ).bounds()
-        return rectangle(low, high)
+        return points_of(rectangle(low, high))
 
     def tables(self, n_anchors: int) -> dict[str, Any]:
         anchors: dict[str, Any] = {"number": n_anchors}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.plans.drawing import Shape
 from rbl_gym.placement.plans.rings import joined, opened
@@ -11,11 +9,6 @@ from rbl_gym.placement.plans.uses import Use, number
 
 # Line ends within this distance are joined, metres.
 _TOLERANCE_M = 0.01
-
-
-def rectangle(low: FloatArray, high: FloatArray) -> list[list[float]]:
-    """Return the corners of a rectangle, counter-clockwise."""
-    return points_of(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))
 
 
 def lines_of(shapes: list[Shape]) -> tuple[list[Shape], list[Shape]]:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.placement.plans.layers import DEVICES, ZONE_M, Building
-from rbl_gym.placement.plans.parts import points_of, rectangle
+from rbl_gym.placement.plans.parts import points_of
 
 __all__ = ["backdrop", "of_picture"]
 
@@ -54,10 +55,8 @@ def of_picture(plan: dict[str, Any], height_m: float = 3.0, n_anchors: int = 8) 
     path, metres_per_pixel = plan["image"], plan["metres_per_pixel"]
     low = np.array(plan["origin"])
     size = np.array(pixels(path)) * metres_per_pixel
-    outline = rectangle(low, low + size)
-    inner = points_of(
-        low + np.array([[0.05, 0.05], [0.95, 0.05], [0.95, 0.95], [0.05, 0.95]]) * size
-    )
+    outline = points_of(rectangle(low, low + size))
+    inner = points_of(rectangle(low + 0.05 * size, low + 0.95 * size))
     tables = {
         "name": Path(path).stem,
         "anchors": {"number": n_anchors},

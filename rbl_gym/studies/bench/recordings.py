@@ -77,36 +77,32 @@ def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...
     return Log(recording, settings, digest.hexdigest()[:16])
 
 
-class Stressed(NamedTuple):
-    """A recording under a condition, as given to filters."""
+def stressed(log: Log, condition: str, seed: int) -> tuple[Recording, replay.Settings]:
+    """Return recording and settings under a condition, as given to filters.
 
-    told: Recording
-    settings: replay.Settings
-
-
-def stressed(log: Log, condition: str, seed: int) -> Stressed:
-    """Apply a condition to a recording, in addition to the errors it already has."""
+    The condition adds to the errors that the recording already has.
+    """
     told, settings = log.recording, log.settings
     rng = np.random.default_rng([seed, int(log.digest, 16)])
     if condition == "nlos":
         reflected = (rng.random(told.ranges.shape) < NLOS_PROBABILITY) & told.links
         ranges = told.ranges + LinkModel().nlos_bias_m * reflected
-        return Stressed(told._replace(ranges=ranges), settings)
+        return told._replace(ranges=ranges), settings
     if condition == "lost-links":
         links = told.links & (rng.random(told.links.shape) >= DROP_PROBABILITY)
-        return Stressed(told._replace(links=links, ranges=told.ranges * links), settings)
+        return told._replace(links=links, ranges=told.ranges * links), settings
     if condition == "noise-x2":
         if settings.range_std_m is None and told.range_std is not None:
-            return Stressed(told._replace(range_std=told.range_std / NOISE_FACTOR), settings)
+            return told._replace(range_std=told.range_std / NOISE_FACTOR), settings
         std = (settings.range_std_m or replay.DEFAULT_RANGE_STD_M) / NOISE_FACTOR
-        return Stressed(told, dataclasses.replace(settings, range_std_m=std))
+        return told, dataclasses.replace(settings, range_std_m=std)
     if condition == "anchor-off":
         # The error is constant, also for a moving anchor.
         anchors = told.anchors + off_by(np.zeros(told.anchors.shape[-2:]), ANCHOR_ERROR_M, rng)
-        return Stressed(told._replace(anchors=anchors), settings)
+        return told._replace(anchors=anchors), settings
     if condition == "tag-off":
-        return Stressed(told._replace(tags=off_by(told.tags, TAG_ERROR_M, rng)), settings)
-    return Stressed(told, settings)
+        return told._replace(tags=off_by(told.tags, TAG_ERROR_M, rng)), settings
+    return told, settings
 
 
 def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:

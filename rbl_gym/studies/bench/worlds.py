@@ -85,17 +85,12 @@ def _true_scene(scene: Scene, condition: str) -> Scene:
     links = scene.links
     if condition == "nlos":
         probability = max(links.nlos_probability, NLOS_PROBABILITY)
-        return dataclasses.replace(
-            scene, links=dataclasses.replace(links, nlos_probability=probability)
-        )
-    if condition == "lost-links":
+        links = dataclasses.replace(links, nlos_probability=probability)
+    elif condition == "lost-links":
         probability = max(links.drop_probability, DROP_PROBABILITY)
-        return dataclasses.replace(
-            scene, links=dataclasses.replace(links, drop_probability=probability)
-        )
-    if condition == "noise-x2":
-        return dataclasses.replace(scene, noise=_noisier(scene.noise, NOISE_FACTOR))
-    return scene
+        links = dataclasses.replace(links, drop_probability=probability)
+    noise = _noisier(scene.noise, NOISE_FACTOR) if condition == "noise-x2" else scene.noise
+    return dataclasses.replace(scene, links=links, noise=noise)
 
 
 def _noisier(noise: Any, factor: float) -> Any:

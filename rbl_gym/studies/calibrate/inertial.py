@@ -36,9 +36,7 @@ class CalibratedInertial(NamedTuple):
     clock: TimeOffset
 
 
-def calibrate_inertial(
-    log: InertialLog, truth: Truth, search_s: float | None = None
-) -> CalibratedInertial:
+def calibrate_inertial(log: InertialLog, truth: Truth) -> CalibratedInertial:
     """Estimate the rotation of a sensor on its body, and its clock, from turn rates.
 
     Parameters
@@ -47,8 +45,6 @@ def calibrate_inertial(
         Log from `rbl_gym.recordings.read_inertial`.
     truth
         Poses of the body; or the track of a filter, as `Truth(times, rotation, translation)`.
-    search_s
-        Clock offsets to try, as in `rbl_gym.recordings.time_offset`.
 
     Raises
     ------
@@ -67,7 +63,7 @@ def calibrate_inertial(
     for _ in range(_ROUNDS):
         # The norm of a rate does not depend on the orientation of the sensor, but on its bias.
         lengths = (np.linalg.norm(a, axis=1) for a in (body, gyro - bias))
-        clock = time_offset(middle, next(lengths), log.times, next(lengths), search_s)
+        clock = time_offset(middle, next(lengths), log.times, next(lengths))
         turn = _turn(log.times - clock.offset_s, gyro, middle, body)
         bias = turn.bias
     return CalibratedInertial(turn, clock)  # pyright: ignore[reportPossiblyUnbound]

@@ -48,7 +48,7 @@ def references(task: RlTask) -> list[str]:
         # There is no single layout for different rooms.
         one = [] if "scenes" in task.arguments else [_ONE_LAYOUT]
         return [*layouts.LAYOUTS, *one, *others, *last]
-    return list(controllers_of(task))
+    return list(_controllers(task))
 
 
 def strongest(task: RlTask) -> list[str]:
@@ -57,10 +57,21 @@ def strongest(task: RlTask) -> list[str]:
     return known[-len(search.STRONGEST) :] if known[-1] in search.STRONGEST else known[-1:]
 
 
-def controllers_of(task: RlTask) -> dict[str, controllers.Controller]:
+def _controllers(task: RlTask) -> dict[str, controllers.Controller]:
     """Return the references of a task with a filter in the loop."""
     mobile = task.env_id == "RBL/MobileAnchors-v0"
     return controllers.MOBILE if mobile else controllers.SELECTION
+
+
+def _generator(task: RlTask, name: str, seed: int) -> np.random.Generator:
+    """Return the random numbers of a reference, which do not depend on the other references."""
+    return np.random.default_rng([seed, references(task).index(name)])
+
+
+def reference_player(task: RlTask, name: str, seed: int) -> Callable[[Any, Any], FloatArray]:
+    """Return a reference of a task with a filter in the loop, for one run over the worlds."""
+    controller, rng = _controllers(task)[name], _generator(task, name, seed)
+    return lambda env, _: controller(env, rng)
 
 
 def evaluate(
@@ -187,26 +198,23 @@ def _figures(
     }
 
 
-def _check_policies(task: RlTask, policies: dict[str, PolicyLike]) -> None:
-    """Raise ValueError for unfit policies or equal labels, before the slow references."""
+def _of_all(
+    task: RlTask,
+    policies: dict[str, PolicyLike],
+    names: list[str],
+    advance: Advance,
+    of_reference: Callable[[str], Any],
+    of_policy: Callable[[PolicyLike], Any],
+) -> dict[str, Any]:
+    """Run one function on references, and another on policies.
+
+    Raises ValueError for unfit policies or equal labels, before the slow references.
+    """
     envs = task.make(1)
     for label, policy in policies.items():
         if label in {*references(task), BEST_KNOWN}:
             raise ValueError(f"policy {label!r} has the name of a reference: rename it")
         check_fit(policy, label, envs)
-
-
-def _of_all(
-    task: RlTask,
-    policies: dict[str, PolicyLike],
-    names: list[str],
-    seed: int,
-    advance: Advance,
-    of_reference: Callable[[str, np.random.Generator], Any],
-    of_policy: Callable[[PolicyLike], Any],
-) -> dict[str, Any]:
-    """Run one function on references, each with its own generator, and another on policies."""
-    _check_policies(task, policies)
     advance(0, more=len(names) + len(policies))
     # Policies first: if one fails, it does so before the slow references.
     played = {}
@@ -215,8 +223,7 @@ def _of_all(
         advance()
     found = {}
     for name in names:
-        rng = np.random.default_rng([seed, references(task).index(name)])
-        found[name] = of_reference(name, rng)
+        found[name] = of_reference(name)
         advance()
     return found | played
 
@@ -232,22 +239,18 @@ def _loop_losses(
     seed: int,
     advance: Advance,
 ) -> dict[str, FloatArray]:
-    def reference(name: str, rng: np.random.Generator) -> FloatArray:
-        controller = controllers_of(task)[name]
-        return _rollout(task, lambda env, _: controller(env, rng), worlds, seed)
+    def losses(act: Callable[[Any, Any], FloatArray]) -> FloatArray:
+        returns, steps = rollouts.returns(task, act, worlds, seed)
+        return -returns / steps
 
-    def policy(played: PolicyLike) -> FloatArray:
-        return _rollout(task, played.player(), worlds, seed)
-
-    return _of_all(task, policies, names, seed, advance, reference, policy)
-
-
-def _rollout(
-    task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
-) -> FloatArray:
-    """Return losses (worlds,) of one episode of each world."""
-    returns, steps = rollouts.returns(task, act, worlds, seed)
-    return -returns / steps
+    return _of_all(
+        task,
+        policies,
+        names,
+        advance,
+        lambda name: losses(reference_player(task, name, seed)),
+        lambda policy: losses(policy.player()),
+    )
 
 
 # --- placement --------------------------------------------------------------------------------
@@ -321,13 +324,17 @@ def layouts_of(
     One entry for all contexts together; if scenes are random, one entry for each world.
     """
     problems = _problems(task, worlds, seed)
+
+    def reference(name: str) -> list[FloatArray]:
+        rng = _generator(task, name, seed)
+        return [_reference_layout(task, *one, name, rng) for one in problems]
+
     found = _of_all(
         task,
         policies,
         names,
-        seed,
         advance,
-        lambda name, rng: [_reference_layout(task, *one, name, rng) for one in problems],
+        reference,
         lambda policy: _policy_layouts(task, policy, worlds, seed, problems),
     )
     return [

@@ -9,7 +9,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
-from rbl_gym.geometry.obstacles import Obstacles, Prisms
+from rbl_gym.geometry.obstacles import Obstacles, Prisms, box_bounds
+from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import cube
 from rbl_gym.placement.tokens import KINDS, Scenery, turned
@@ -102,8 +103,8 @@ def _building(rng: np.random.Generator, n_fixed: int) -> _Building:
     size = np.array([x, y, rng.uniform(2.5, 5.0)])
     solid, shares = _inner_walls(rng, size)
     blocked = float(rng.choice([0.01, 0.02, 0.05]))
-    low, high = (solid[:, 2] + sign * solid[:, 5] for sign in (-1, 1))
-    prisms = Prisms.packed([_ring(box) for box in solid], low, high, shares)
+    low, high = box_bounds(solid)
+    prisms = Prisms.packed(list(rectangle(low, high)), low[:, 2], high[:, 2], shares)
     obstacles = Obstacles(np.empty((0, 6)), blocked, prisms)
     zones, extent = _zones(rng, size)
     spots, normals = _spots(rng, size, solid)
@@ -127,11 +128,6 @@ def _building(rng: np.random.Generator, n_fixed: int) -> _Building:
         zones, np.array(extent), boxes, spots, normals, views, fixed, rotation, places, weight,
         prior, gain.numbers,
     )  # fmt: skip
-
-
-def _ring(box: FloatArray) -> FloatArray:
-    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return box[:2] + turns * box[3:5]
 
 
 def _inner_walls(rng: np.random.Generator, size: FloatArray) -> tuple[FloatArray, FloatArray]:

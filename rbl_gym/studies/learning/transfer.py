@@ -10,7 +10,6 @@ Tasks with a filter in the loop: episodes with other filters than that of the tr
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -36,8 +35,6 @@ __all__ = [
     "FILTERS",
     "track_layouts",
     "tracking_filters",
-    "transfer_layouts",
-    "transfer_loops",
     "transfer_references",
     "transfer_task",
 ]
@@ -87,48 +84,44 @@ def transfer_task(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Return `transfer_loops` of a task with a filter in the loop, otherwise `transfer_layouts`.
+    """Run policies and references in held-out worlds, and measure their tracking errors.
 
-    Arguments as in those functions; only layouts have `repeats`.
+    In a placement task, they place anchors, and filters track bodies among these. In a task with a
+    filter in the loop, each filter takes its place, and they act on the belief of that filter.
+
+    Parameters
+    ----------
+    task, policies
+        The task, and policies by label.
+    names
+        Names of `evaluation.references`.
+    worlds, repeats, seed
+        Number of held-out worlds, number of bodies in each (of a placement task), and the seed.
+    advance
+        Called after each layout, then after each filter and label.
+
+    Returns
+    -------
+    The result of `track_layouts`, with `worlds` and `seed`. With a filter in the loop, score and
+    error are those of the steps after the first ten; the correlation is over the worlds.
     """
     if task.env_id in _OWN_SCENES:
-        return transfer_loops(task, policies, names, worlds, seed, advance)
-    return transfer_layouts(task, policies, names, worlds, repeats, seed, advance)
+        return _transfer_loops(task, policies, names, worlds, seed, advance)
+    groups = evaluation.layouts_of(task, policies, names, worlds, seed, advance)
+    found = track_layouts(groups, tracking_filters(task), repeats, seed, advance)
+    return found | {"worlds": worlds, "seed": seed}
 
 
-def transfer_loops(
+def _transfer_loops(
     task: RlTask,
     policies: dict[str, PolicyLike],
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Advance = silent,
+    advance: Advance,
 ) -> dict[str, Any]:
-    """Run policies and references in held-out worlds with each filter in the loop.
-
-    Policies and references act on the belief of that filter.
-
-    Parameters
-    ----------
-    task
-        A task with a filter in the loop.
-    policies
-        Policies by label.
-    names
-        Names of `evaluation.references`.
-    worlds, seed
-        Held-out worlds.
-    advance
-        Called after every filter and label.
-
-    Returns
-    -------
-    As `track_layouts`, with `worlds` and `seed`. Score and error are those of the steps after the
-    first ten; the correlation is over the worlds.
-    """
     for label, policy in policies.items():
         check_fit(policy, label, task.make(1))
-    table = evaluation.controllers_of(task)
     filters = tracking_filters(task)
     advance(0, more=len(filters) * (len(names) + len(policies)))
     found: dict[str, Any] = {}
@@ -139,20 +132,10 @@ def transfer_loops(
             if label in policies:
                 act: Any = policies[label].player()
             else:
-                rng = np.random.default_rng([seed, evaluation.references(task).index(label)])
-                act = functools.partial(_controlled, table[label], rng)
-            score, error = _episode_logs(under, act, worlds, seed)
-            rows[label] = {
-                "score_m": float(np.exp(score.mean())),
-                "tag_rmse_m": float(np.exp(error.mean())),
-                "correlation": _correlation(score, error),
-            }
+                act = evaluation.reference_player(task, label, seed)
+            rows[label] = _figures(*_episode_logs(under, act, worlds, seed))
             advance()
     return {"filters": found, "worlds": worlds, "seed": seed}
-
-
-def _controlled(controller: Any, rng: np.random.Generator, env: Any, _: Any) -> FloatArray:
-    return controller(env, rng)
 
 
 def _with_filter(task: RlTask, name: str) -> RlTask:
@@ -200,39 +183,6 @@ class Bodies(NamedTuple):
     prior: tuple[FloatArray, FloatArray]
 
 
-def transfer_layouts(
-    task: RlTask,
-    policies: dict[str, PolicyLike],
-    names: list[str],
-    worlds: int,
-    repeats: int,
-    seed: int,
-    advance: Advance = silent,
-) -> dict[str, Any]:
-    """Place anchors by policies and references in held-out worlds, and track bodies among them.
-
-    Parameters
-    ----------
-    task
-        A placement task.
-    policies
-        Policies by label.
-    names
-        Names of `evaluation.references`.
-    worlds, repeats, seed
-        Number of held-out worlds, number of bodies in each, and the seed.
-    advance
-        Called after each layout, then after each filter and label.
-
-    Returns
-    -------
-    The result of `track_layouts`, with `worlds` and `seed`.
-    """
-    groups = evaluation.layouts_of(task, policies, names, worlds, seed, advance)
-    found = track_layouts(groups, tracking_filters(task), repeats, seed, advance)
-    return found | {"worlds": worlds, "seed": seed}
-
-
 def track_layouts(
     groups: list[Layouts], filters: list[str], repeats: int, seed: int, advance: Advance = silent
 ) -> dict[str, Any]:
@@ -270,11 +220,7 @@ def track_layouts(
                 for one, bodies in zip(groups, several, strict=True)
             ]
             score, errors = (np.concatenate(part) for part in zip(*pairs, strict=True))
-            rows[label] = {
-                "score_m": float(np.exp(score.mean())),
-                "tag_rmse_m": float(np.exp(errors.mean())),
-                "correlation": _correlation(score, errors),
-            }
+            rows[label] = _figures(score, errors)
             advance()
         result["filters"][name] = rows
     return result
@@ -296,8 +242,13 @@ def _logs(
     return np.log(score).ravel(), np.log(np.stack(errors, axis=1)).ravel()
 
 
-def _correlation(first: FloatArray, second: FloatArray) -> float | None:
-    return float(np.corrcoef(first, second)[0, 1]) if len(first) > 2 else None
+def _figures(score: FloatArray, error: FloatArray) -> dict[str, float | None]:
+    """Return the figures of a filter and a label from logarithms (worlds,) or (layouts,)."""
+    return {
+        "score_m": float(np.exp(score.mean())),
+        "tag_rmse_m": float(np.exp(error.mean())),
+        "correlation": float(np.corrcoef(score, error)[0, 1]) if len(score) > 2 else None,
+    }
 
 
 def _bodies(

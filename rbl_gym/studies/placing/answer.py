@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.geometry.obstacles import box_bounds
 from rbl_gym.placement import criteria, scene_files
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing import check, choosing, design
@@ -232,8 +233,8 @@ def _result(
 def _obstacles(problem: Problem) -> list[dict[str, Any]]:
     boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
     rows: list[dict[str, Any]] = [
-        {"low_m": (box[:3] - box[3:]).tolist(), "high_m": (box[:3] + box[3:]).tolist()}
-        for box in boxes
+        {"low_m": low.tolist(), "high_m": high.tolist()}
+        for low, high in zip(*box_bounds(boxes), strict=True)
     ]
     for corners, low, high, share in zip(
         prisms.corners, prisms.low_m, prisms.high_m, prisms.share, strict=True

@@ -11,7 +11,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.geometry.obstacles import box_bounds
+from rbl_gym.geometry.polygons import area, contains, rectangle
 from rbl_gym.placement.plans.drawing import UNITS
 from rbl_gym.placement.scene_files import Problem
 from rbl_gym.recordings.writing import write_table
@@ -247,9 +248,8 @@ def _write_dxf(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
 def _draw_building(document: Any, problem: Problem) -> None:
     """Add outlines of obstacles and zones, on layers that `rbl-gym plan` recognises."""
     model = document.modelspace()
-    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    boxes = problem.obstacles.boxes
-    rings = [*(box[:2] + turns * box[3:5] for box in boxes), *problem.obstacles.prisms.corners]
+    obstacles = problem.obstacles
+    rings = [*rectangle(*box_bounds(obstacles.boxes)), *obstacles.prisms.corners]
     for layer, outlines in (
         ("OBSTACLES", rings),
         ("ZONES", [zone.polygon for zone in problem.zones]),

@@ -19,7 +19,6 @@ from rbl_gym.studies.learning.trained_worlds import common_worlds
 from rbl_gym.studies.watching.frames import Frame
 from rbl_gym.studies.watching.played import env_frames
 from rbl_gym.studies.watching.program import Disturb, Program, env_program
-from rbl_gym.wrappers import controllers
 
 __all__ = ["learned_frames", "learned_program", "played_program"]
 
@@ -145,13 +144,11 @@ def _mean(logs: list[float]) -> float:
 
 def _reference_steps(task: RlTask, name: str, seed: int) -> Iterator[tuple[FloatArray, float]]:
     """Yield anchors (M, 3) and b, metres, of a held-out episode from its reset on."""
-    mobile = task.env_id == "RBL/MobileAnchors-v0"
-    table: Any = controllers.MOBILE if mobile else controllers.SELECTION
-    rng = np.random.default_rng([seed, evaluation.references(task).index(name)])
-    env, _, info = rollouts.held_out(task, 1, seed)
+    act = evaluation.reference_player(task, name, seed)
+    env, seen, info = rollouts.held_out(task, 1, seed)
     while True:
         yield env.anchors[0].copy(), float(info["score_m"][0])
-        _, _, terminated, truncated, info = env.step(table[name](env, rng))
+        seen, _, terminated, truncated, info = env.step(act(env, seen))
         if (terminated | truncated).any():
             yield env.anchors[0].copy(), float(info["score_m"][0])
             return
