@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
 import os
@@ -14,10 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, kernels, motion
+from rbl_gym import bounds, estimators, kernels, metrics, motion
+from rbl_gym.bounds.smoothing import smoothing_crb
+from rbl_gym.estimators import smoothing
 from rbl_gym.estimators.filter import reads
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
+from rbl_gym.studies import monte_carlo
 from rbl_gym.studies.progress import Advance
 
 DATA = Path(__file__).parent / "data"
@@ -54,6 +58,44 @@ def twist_filters() -> list[str]:
 def load(name: str) -> Any:
     """A reference file of tests/data."""
     return json.loads((DATA / name).read_text(encoding="utf-8"))
+
+
+def reference_filter(name: str, track: Any, **options: Any) -> Any:
+    """A filter with the laws of the reference file ``track.json``."""
+    return estimators.make(
+        name,
+        tags=np.array(track["C"]).T,
+        noise=ranging.SquaredRangeNoise(track["sigma"]),
+        process=motion.ProcessNoise(track["sigma_q_rad"], track["sigma_t"]),
+        **options,
+    )
+
+
+def assert_bound(P: np.ndarray, Q: np.ndarray, want: dict[str, float]) -> None:
+    """Assert the three figures of a bound (6, 6) in a reference file."""
+    angle = np.rad2deg(metrics.expected_mean_angular_error(P, Q))
+    np.testing.assert_allclose(angle, want["mean_angular_error_deg"], rtol=1e-9)
+    frobenius = np.sqrt(2 * np.trace(P[:3, :3]))
+    np.testing.assert_allclose(frobenius, want["rotation_frobenius_rmse"], rtol=1e-9)
+    rmse = np.sqrt(np.trace(P[3:, 3:]))
+    np.testing.assert_allclose(rmse, want["translation_rmse_m"], rtol=1e-9)
+
+
+def changed_tables(tables: Any, path: str, value: object) -> dict:
+    """Tables of a file with one entry changed, added at the end of a list, or out for None."""
+    tables = copy.deepcopy(tables)
+    *parents, key = path.split(".")
+    node: Any = tables
+    for parent in parents:
+        node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
+    index: Any = int(key) if isinstance(node, list) else key
+    if value is None:
+        del node[index]
+    elif isinstance(node, list) and index == len(node):
+        node.append(value)
+    else:
+        node[index] = value
+    return tables
 
 
 def run_python(code: str) -> list[str]:
@@ -116,6 +158,33 @@ def draw_biases(law, times, links, rng, batch=()):
         kept = law.decay(step)
         drawn[k + 1] = kept * drawn[k] + (1 - kept**2) ** 0.5 * drawn[k + 1]
     return np.moveaxis(drawn, 0, -2)
+
+
+def smoothed_trials(scene, trials: int, seed: int, offset: str | None = None):
+    """Smoothed episodes of a scene with a known twist: result, pose errors, and their bound."""
+    world = monte_carlo.simulate_trials(scene, trials, np.random.default_rng(seed))
+    told: Any = monte_carlo.told_readings(scene, world.episode, world.measurements)
+    episode = world.episode
+    times = np.cumsum([reading.dt for reading in told])
+    twists = np.stack([reading.twist for reading in told[1:]], axis=1)
+    ranges, anchors = np.stack([r.ranges for r in told], axis=1), episode.anchors[:, None]
+    log = smoothing.RangeLog(times, ranges, anchors)
+    prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
+    filter = monte_carlo.scene_filter(scene, "iekf", {})
+    start = smoothing.causal_track(filter, log, prior, twists)
+    twist = smoothing.KnownTwist(scene.process, twists)
+    found = smoothing.smooth(
+        log, smoothing.LogModel(scene.body, scene.noise, twist, offset=offset), prior, start
+    )
+    truth = episode.rotation, episode.translation
+    error = metrics.pose_error(found.rotation, found.translation, *truth)
+    limit = smoothing_crb(
+        bounds.RangeEpoch(anchors, scene.body, *truth, scene.noise),
+        bounds.KnownTwist(twists, scene.dt, scene.process),
+        episode.prior_covariance,
+        offset=offset,
+    )
+    return found, error, limit
 
 
 def is_legal(task, anchors):

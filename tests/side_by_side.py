@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -20,6 +21,20 @@ from tests.helpers import assert_same
 def peer_of(scalar: Any, mode: Any, n: int, arguments: dict[str, Any]) -> SyncVectorEnv:
     """Gymnasium's vector environment of n scalar ones."""
     return SyncVectorEnv([lambda: scalar(**arguments)] * n, autoreset_mode=mode)
+
+
+def assert_refused(scalar: Any, arguments: dict[str, Any], action: Any, message: str) -> None:
+    """Assert that a bad action is refused, before a reset too, and changes nothing."""
+    env, peer = scalar(**arguments), scalar(**arguments)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(env.action_space.sample())
+    env.reset(seed=1)
+    peer.reset(seed=1)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    env.action_space.seed(1)
+    good = env.action_space.sample()
+    assert_same(env.step(good), peer.step(good))
 
 
 def actions_of(env: Any, rng: np.random.Generator) -> np.ndarray:

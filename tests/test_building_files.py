@@ -21,7 +21,7 @@ from rbl_gym.placement import building, criteria, scene_files
 from rbl_gym.placement.file_keys import FORMAT, MATERIALS
 from rbl_gym.placement.file_schema import schema
 from rbl_gym.placement.file_walls import wall_pieces
-from tests.helpers import ROOT, needs
+from tests.helpers import ROOT, changed_tables, needs
 
 OFFICE = tomllib.loads((ROOT / "examples" / "office.toml").read_text(encoding="utf-8"))
 SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4]]
@@ -35,20 +35,7 @@ HALL = {
 
 
 def changed(path: str, value: object, tables: Any = OFFICE) -> dict:
-    """The tables with one entry changed, added at the end of a list, or taken out for None."""
-    tables = copy.deepcopy(tables)
-    *parents, key = path.split(".")
-    node: Any = tables
-    for parent in parents:
-        node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
-    index: Any = int(key) if isinstance(node, list) else key
-    if value is None:
-        del node[index]
-    elif isinstance(node, list) and index == len(node):
-        node.append(value)
-    else:
-        node[index] = value
-    return tables
+    return changed_tables(tables, path, value)
 
 
 def anywhere(problem, count=800) -> np.ndarray:

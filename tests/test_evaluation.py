@@ -330,9 +330,9 @@ def test_the_strongest_searches_stay_those_that_count_as_1(monkeypatch):
 
 
 def test_correlations_need_three():
-    assert transfer._correlation(np.array([1.0]), np.array([2.0])) is None
+    assert transfer._figures(np.array([1.0]), np.array([2.0]))["correlation"] is None
     values = np.array([1.0, 2.0, 4.0])
-    assert transfer._correlation(values, 3 - 2 * values) == pytest.approx(-1)
+    assert transfer._figures(values, 3 - 2 * values)["correlation"] == pytest.approx(-1)
 
 
 # --- the command line -------------------------------------------------------------------------
@@ -451,7 +451,7 @@ def test_transfer_of_a_loop_by_hand():
 
 def test_transfer_of_a_loop_in_its_own_scene_and_a_short_one(tmp_path, capsys):
     with pytest.raises(ValueError, match="policy 'other' does not fit"):
-        transfer.transfer_loops(rl_task("selection"), {"other": random_policy()}, [], 1, 0)
+        transfer.transfer_task(rl_task("selection"), {"other": random_policy()}, [], 1, 1, 0)
     path = tmp_path / "mine.npz"
     policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
     scene = tmp_path / "hall.json"

@@ -6,6 +6,8 @@ that names the argument, or Gymnasium's own error. docs/fuzzing.md says what is 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
@@ -60,8 +62,23 @@ def good(name: str, vector: bool) -> dict[str, Any]:
     return {**WORLDS[name], **COMMON, **(BATCH if vector else {})}
 
 
-def names(error: Exception, known: set[str]) -> bool:
-    return isinstance(error, gym.error.Error) or any(one in str(error) for one in known)
+@contextmanager
+def named(problems: list[str], tried: str, known: set[str]) -> Iterator[None]:
+    """Collect as problems all errors but those that name one of `known`, or Gymnasium's own."""
+    try:
+        yield
+    except gym.error.Error:
+        pass
+    except (ValueError, TypeError) as error:
+        if not any(one in str(error) for one in known):
+            problems.append(f"{tried}: {error}")
+    except Exception as error:
+        problems.append(f"{tried}: {type(error).__name__}: {error}")
+
+
+def known_of(argument: str, value: Any) -> set[str]:
+    """Names that an error may give: of options the filter names the one that is wrong."""
+    return {argument, *(map(str, value) if isinstance(value, dict) else ())}
 
 
 def episode(env: Any, name: str) -> None:
@@ -84,16 +101,9 @@ def test_constructors(name, vector):
     for argument in arguments:
         # The checks are common to both forms: half of the values each.
         for value in values[vector::2]:
-            try:
-                env = made(name, vector, **{**arguments, argument: value})
-                episode(env, name)
-            except (ValueError, TypeError) as error:
-                # Of options the filter names the one that is wrong.
-                known = {argument, "scene", *(map(str, value) if isinstance(value, dict) else ())}
-                if not names(error, known):
-                    problems.append(f"{argument} = {value!r:.60}: {error}")
-            except Exception as error:
-                problems.append(f"{argument} = {value!r:.60}: {type(error).__name__}: {error}")
+            known = {"scene", *known_of(argument, value)}
+            with named(problems, f"{argument} = {value!r:.60}", known):
+                episode(made(name, vector, **{**arguments, argument: value}), name)
     assert not problems, "\n".join(problems)
 
 
@@ -105,16 +115,9 @@ def test_actions(name, vector):
     problems = []
     for action in ACTIONS:
         env.reset(seed=0)
-        try:
+        with named(problems, f"{action!r:.60}", {"action"}):
             observation, reward, *_ = env.step(action)
-        except (ValueError, TypeError) as error:
-            if "action" not in str(error):
-                problems.append(f"{action!r:.60}: {error}")
-        except Exception as error:
-            problems.append(f"{action!r:.60}: {type(error).__name__}: {error}")
-        else:
-            sound = env.observation_space.contains(observation) and np.isfinite(reward).all()
-            if not sound:
+            if not (env.observation_space.contains(observation) and np.isfinite(reward).all()):
                 problems.append(f"{action!r:.60}: {observation}, {reward}")
     episode(env, name)
     assert not problems, "\n".join(problems)
@@ -130,15 +133,8 @@ def test_seeds_and_reset_options(name, vector):
         tried += [{"options": {"reset_mask": mask}} for mask in [*WRONG, np.zeros(2, np.bool_)]]
         tried += [{"options": options} for options in WRONG]
     for arguments in tried:
-        try:
+        with named(problems, f"{arguments!r:.80}", {"seed", "options", "reset_mask"}):
             env.reset(**arguments)
-        except (ValueError, TypeError) as error:
-            if not names(error, {"seed", "options", "reset_mask"}):
-                problems.append(f"{arguments!r:.80}: {error}")
-        except gym.error.Error:
-            pass
-        except Exception as error:
-            problems.append(f"{arguments!r:.80}: {type(error).__name__}: {error}")
         episode(env, name)
     assert not problems, "\n".join(problems)
 
@@ -165,14 +161,8 @@ def test_wrappers(name, vector):
     problems = []
     for argument in arguments:
         for value in [*WRONG, *SIZES, {"robust": "x"}, {"nothing": 1}, {1: 2}]:
-            try:
+            with named(problems, f"{argument} = {value!r:.60}", known_of(argument, value)):
                 episode(wrapper(env, **{**arguments, argument: value}), name)
-            except (ValueError, TypeError) as error:
-                known = {argument, *(map(str, value) if isinstance(value, dict) else ())}
-                if not names(error, known):
-                    problems.append(f"{argument} = {value!r:.60}: {error}")
-            except Exception as error:
-                problems.append(f"{argument} = {value!r:.60}: {type(error).__name__}: {error}")
     for other in (None, "x", made("MobileAnchors", vector)):
         with pytest.raises((ValueError, TypeError, AssertionError), match="env"):
             wrapper(other)

@@ -12,7 +12,7 @@ from rbl_gym.estimators.linear.least_squares import vec
 from rbl_gym.estimators.linear.unitary import state_jacobian
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
-from tests.helpers import load, random_world, simulate, textbook_model
+from tests.helpers import load, random_world, reference_filter, simulate, textbook_model
 
 FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]
 NOISE = ranging.SquaredRangeNoise(0.05)
@@ -26,13 +26,7 @@ TWIST = np.array([0.2, -0.1, 0.3, 1.0, -0.5, 0.2])
 )
 def test_track_of_the_reference_implementation(name, key, engine):
     track = load("track.json")
-    filter = estimators.make(
-        name,
-        tags=np.array(track["C"]).T,
-        noise=ranging.SquaredRangeNoise(track["sigma"]),
-        process=motion.ProcessNoise(track["sigma_q_rad"], track["sigma_t"]),
-        engine=engine,
-    )
+    filter = reference_filter(name, track, engine=engine)
     state = filter.initial(np.eye(3), np.zeros(3), 100 * np.eye(12))
     for step in track["steps"]:
         state = filter.predict(state, track["twist"], 1.0)

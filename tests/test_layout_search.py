@@ -180,7 +180,7 @@ def test_cma_es_is_never_worse_than_its_start(scene):
     start = layouts.random(task, context, rng())
     before = placement.score(task, context, start)
     for generations in (0, 1, 8):
-        found = cma_es(task, context, rng(), generations, 6, 0.3, start)
+        found = cma_es(task, context, rng(), generations, 6, start)
         after = placement.score(task, context, found)
         assert (after <= before * (1 + 1e-9)).all()
     assert (after < before).any()

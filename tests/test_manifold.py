@@ -14,7 +14,7 @@ from rbl_gym.estimators.filter import inverse
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
-from tests.helpers import load, random_world, simulate
+from tests.helpers import load, random_world, reference_filter, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
@@ -26,12 +26,7 @@ def make(tags, **options):
 
 def test_track_of_the_reference_implementation_from_its_first_step():
     track = load("track.json")
-    filter = estimators.make(
-        "iekf",
-        tags=np.array(track["C"]).T,
-        noise=ranging.SquaredRangeNoise(track["sigma"]),
-        process=motion.ProcessNoise(track["sigma_q_rad"], track["sigma_t"]),
-    )
+    filter = reference_filter("iekf", track)
     first, *others = track["steps"]
     given = first["IEKF6raw"]
     state = filter.initial(given["Q"], given["t"], given["P"])
@@ -48,12 +43,7 @@ def test_track_of_the_reference_implementation_from_its_first_step():
 
 def test_the_papers_vague_prior_finds_the_reference_pose_by_itself():
     track = load("track.json")
-    filter = estimators.make(
-        "iekf",
-        tags=np.array(track["C"]).T,
-        noise=ranging.SquaredRangeNoise(track["sigma"]),
-        process=motion.ProcessNoise(track["sigma_q_rad"], track["sigma_t"]),
-    )
+    filter = reference_filter("iekf", track)
     state = filter.initial(np.eye(3), np.zeros(3), np.diag([50.0] * 3 + [100.0] * 3))
     state = filter.predict(state, track["twist"], 1.0)
     first = track["steps"][0]

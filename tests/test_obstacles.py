@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbl_gym.geometry.obstacles import Obstacles, check_obstacles, in_sight
+from rbl_gym.geometry import polygons
+from rbl_gym.geometry.obstacles import Obstacles, box_bounds, check_obstacles, in_sight
 
 BOX = np.array([0.0, 0, 0, 1, 2, 3])
 
@@ -177,3 +178,12 @@ def test_obstacles_tell_the_share_of_each_link():
     assert not nothing
     assert (nothing.share(anchors, points) == 1).all()
     assert not nothing.contain(points).any()
+
+
+def test_boxes_have_corners_and_a_rectangle_in_plan():
+    low, high = box_bounds(np.array([[2.0, 1, 5, 1, 0.5, 3], [0, 0, 0, 1, 1, 1]]))
+    np.testing.assert_array_equal(low, [[1, 0.5, 2], [-1, -1, -1]])
+    np.testing.assert_array_equal(high, [[3, 1.5, 8], [1, 1, 1]])
+    rings = polygons.rectangle(low, high)
+    np.testing.assert_array_equal(rings[0], [[1, 0.5], [3, 0.5], [3, 1.5], [1, 1.5]])
+    assert [polygons.area(ring) for ring in rings] == [2, 4]

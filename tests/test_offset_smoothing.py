@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from rbl_gym import bounds, metrics, ranging
-from rbl_gym.bounds.smoothing import smoothing_crb
+from rbl_gym import metrics, ranging
 from rbl_gym.estimators.costs.losses import huber
-from rbl_gym.estimators.smoothing import KnownTwist, LogModel, RangeLog, causal_track, smooth
+from rbl_gym.estimators.smoothing import KnownTwist, LogModel, RangeLog, smooth
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets
 from rbl_gym.motion import ProcessNoise
-from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scenes
+from tests.helpers import smoothed_trials
 
 every_offset = pytest.mark.parametrize("offset", offsets.OFFSETS)
 NOISE = ranging.RangeNoise(0.05)
@@ -93,28 +92,8 @@ def test_a_constant_more_changes_nothing(loss):
 def test_reaches_its_bound_with_honest_beliefs():
     """60 trials of 31 epochs: the ratio's deviation is about 2 %, that of NEES/6 about 1 %."""
     scene = scenes.get({"name": "uwb_room", "steps": 30, "links": {"offset": "tag"}})
-    trials = monte_carlo.simulate_trials(scene, 60, np.random.default_rng(2))
-    told: Any = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
-    episode = trials.episode
-    times = np.cumsum([reading.dt for reading in told])
-    twists = np.stack([reading.twist for reading in told[1:]], axis=1)
-    log = RangeLog(times, np.stack([r.ranges for r in told], axis=1), episode.anchors[:, None])
-    prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
-    start = causal_track(monte_carlo.scene_filter(scene, "iekf", {}), log, prior, twists)
-    model = LogModel(scene.body, scene.noise, KnownTwist(scene.process, twists), offset="tag")
-    found = smooth(log, model, prior, start)
+    found, error, limit = smoothed_trials(scene, 60, 2, offset="tag")
     assert found.converged.all()
-    error = metrics.pose_error(
-        found.rotation, found.translation, episode.rotation, episode.translation
-    )
-    limit = smoothing_crb(
-        bounds.RangeEpoch(
-            episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise
-        ),
-        bounds.KnownTwist(twists, scene.dt, scene.process),
-        scene.prior_covariance,
-        offset="tag",
-    )
     for block in (slice(0, 3), slice(3, 6)):
         of_bound = np.trace(limit[..., block, block], axis1=-2, axis2=-1).mean()
         square = np.square(error[..., block]).sum(axis=-1).mean()

@@ -71,14 +71,17 @@ def test_an_anchor_on_a_tag_tells_nothing_of_that_tag():
     assert_close(got, np.eye(6) + seen, 1e-12)
 
 
-@pytest.mark.parametrize("J", [np.zeros((2, 6, 6)), np.full((2, 6, 6), np.nan)])
-def test_singular_information_is_refused(J):
+@pytest.mark.parametrize(
+    ("J", "prior"),
+    [(np.zeros((2, 6, 6)), np.eye(6)), (np.full((2, 6, 6), np.nan), np.eye(6)), (None, -np.eye(6))],
+)
+def test_singular_information_is_refused(J, prior):
     scene = scenes.get("uwb_room")
     episode = simulation.draw_episode(scene, np.random.default_rng(0), (2,))
     links = np.zeros((2, scene.n_anchors, len(scene.tags)), bool)
-    with pytest.raises(ValueError, match="information about the pose is singular"):
+    with pytest.raises(ValueError, match="information about the pose is singular or not finite"):
         scene_bounds.posterior_step(
-            scene, simulation.epoch_of(episode, 0), episode.anchors, links, J, np.eye(6)
+            scene, simulation.epoch_of(episode, 0), episode.anchors, links, J, prior
         )
 
 

@@ -20,7 +20,7 @@ from rbl_gym.placement import design, scene_files
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.bench import spec_files, worlds
-from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds import scenes
 from tests import recorded
 
 TAGS = bodies.pyramid()
@@ -142,15 +142,6 @@ def test_lost_links_out_of_reach_are_drawn_as_lost():
     assert (distance > 8).any()
     expected = bounds.pose_crb(ANCHORS, *PLACE, noise, links=distance <= 8)
     np.testing.assert_allclose(near, expected, rtol=1e-10)
-
-
-def test_the_bound_of_a_scene_whose_prior_is_not_positive():
-    scene = scenes.SCENES["uwb_room"]
-    episode = simulation.draw_episode(scene, np.random.default_rng(0))
-    at = simulation.epoch_of(episode, 0)
-    links = np.zeros((len(episode.anchors), len(scene.tags)), bool)
-    with pytest.raises(ValueError, match="information about the pose is singular or not finite"):
-        scene_bounds.posterior_step(scene, at, episode.anchors, links, None, -np.eye(6))
 
 
 def test_ranges_are_simulated_by_generators_and_link_models():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import motion, recordings
+from rbl_gym import recordings
 from rbl_gym.app import reports
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Recording, Truth
@@ -276,27 +276,25 @@ def test_two_faults_are_both_hinted():
     assert re.search("quaternions look like x, y, z, w .*, with .*world frame", notes[0])
 
 
-def test_a_planar_offset_of_the_heading_is_hinted():
+def planar_note(change):
+    """The only note on a planar body, of whose true headings something is changed."""
     settings = replay.Settings.of(planar=True, height_offset_m=0.0)
     times, _, place = moving(0.05)
-    flat = motion.Path(rotations.exp(0.4 * times[:, None] * [0, 0, 1]), place)
-    turn = rotations.exp(np.array([0, 0, -0.2]))
-    recording, track = pair(Truth(times, flat.rotation @ turn, flat.translation))
+    heading = rotations.exp(0.4 * times[:, None] * [0, 0, 1])
+    recording, track = pair(Truth(times, change(heading), place))
     track = track._replace(rotation=rotations.exp(0.4 * track.times[:, None] * [0, 0, 1]))
     found = replay.track_errors(recording, track, settings)
-    notes = replay.track_figures(recording, track, found, settings)["notes"]
-    assert len(notes) == 1
-    assert "body frame, turned by (0.0, 0.0, 11.5) deg" in notes[0].replace("-0.0", "0.0")
+    (note,) = replay.track_figures(recording, track, found, settings)["notes"]
+    return note
+
+
+def test_a_planar_offset_of_the_heading_is_hinted():
+    note = planar_note(lambda R: R @ rotations.exp(np.array([0, 0, -0.2])))
+    assert "body frame, turned by (0.0, 0.0, 11.5) deg" in note.replace("-0.0", "0.0")
 
 
 def test_another_order_of_quaternions_is_hinted_for_planar_bodies():
-    settings = replay.Settings.of(planar=True, height_offset_m=0.0)
-    times, _, place = moving(0.05)
-    q = rotations.quaternion(rotations.exp(0.4 * times[:, None] * [0, 0, 1]))
-    turned = rotations.from_quaternion(np.roll(q, -1, axis=-1))
-    recording, track = pair(Truth(times, turned, place))
-    track = track._replace(rotation=rotations.exp(0.4 * track.times[:, None] * [0, 0, 1]))
-    found = replay.track_errors(recording, track, settings)
-    notes = replay.track_figures(recording, track, found, settings)["notes"]
-    assert len(notes) == 1
-    assert re.search("quaternions look like x, y, z, w in columns named w, x, y, z: ", notes[0])
+    note = planar_note(
+        lambda R: rotations.from_quaternion(np.roll(rotations.quaternion(R), -1, axis=-1))
+    )
+    assert re.search("quaternions look like x, y, z, w in columns named w, x, y, z: ", note)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import tomllib
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from rbl_gym.placement.file_tables import read_table
 from rbl_gym.placement.problem import PlacementTask
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scenes import SCENES
-from tests.helpers import ROOT, needs, share_by_hand
+from tests.helpers import ROOT, changed_tables, needs, share_by_hand
 
 GOOD = {
     "anchors": {"kind": "room", "low": [0, 0, 0.3], "high": [8, 6, 3], "number": 5},
@@ -33,19 +31,7 @@ GOOD = {
 
 
 def changed(path: str, value: object) -> dict:
-    """GOOD with one entry changed, or taken out for None."""
-    tables = copy.deepcopy(GOOD)
-    *parents, key = path.split(".")
-    node: Any = tables
-    for parent in parents:
-        node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
-    if value is None:
-        del node[key]
-    elif isinstance(node, list):
-        node[int(key)] = value
-    else:
-        node[key] = value
-    return tables
+    return changed_tables(GOOD, path, value)
 
 
 def test_the_example_is_read():

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from rbl_gym import bounds, estimators, metrics, ranging
-from rbl_gym.bounds.smoothing import smoothing_crb
+from rbl_gym import estimators, metrics, ranging
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, expected_square, huber, loss_of
 from rbl_gym.estimators.smoothing import (
     Factor,
@@ -32,9 +31,8 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.motion.unknown_twist import WanderingTwist, simulate_wandering
-from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds.scenes import SCENES
-from tests.helpers import random_world
+from tests.helpers import random_world, smoothed_trials
 
 WANDER = WanderingTwist(0.4, 1.0, 0.3, 0.8)
 PROCESS = ProcessNoise(0.05, 0.1)
@@ -315,29 +313,8 @@ def test_ranges_with_a_time_each_and_a_deviation_each():
 
 @pytest.mark.parametrize(("name", "seed"), [("uwb_room", 1), ("drone_yard", 2)])
 def test_reaches_its_bound_with_honest_beliefs(name, seed):
-    scene = SCENES[name]
-    trials = monte_carlo.simulate_trials(scene, 40, np.random.default_rng(seed))
-    told: Any = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
-    episode = trials.episode
-    times = np.cumsum([reading.dt for reading in told])
-    twists = np.stack([reading.twist for reading in told[1:]], axis=1)
-    log = RangeLog(times, np.stack([r.ranges for r in told], axis=1), episode.anchors[:, None])
-    prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
-    filter = monte_carlo.scene_filter(scene, "iekf", {})
-    start = causal_track(filter, log, prior, twists)
-    model = LogModel(scene.body, scene.noise, KnownTwist(scene.process, twists))
-    found = smooth(log, model, prior, start)
+    found, error, limit = smoothed_trials(SCENES[name], 40, seed)
     assert found.converged.all()
-    error = metrics.pose_error(
-        found.rotation, found.translation, episode.rotation, episode.translation
-    )
-    limit = smoothing_crb(
-        bounds.RangeEpoch(
-            episode.anchors[:, None], scene.body, episode.rotation, episode.translation, scene.noise
-        ),
-        bounds.KnownTwist(twists, scene.dt, scene.process),
-        episode.prior_covariance,
-    )
     for axes in (slice(0, 3), slice(3, 6)):
         claimed = np.diagonal(limit, axis1=-2, axis2=-1)[..., axes].sum(axis=-1).mean()
         ratio = np.square(error[..., axes]).sum(axis=-1).mean() / claimed

@@ -154,7 +154,7 @@ def test_place(capsys):
 def test_transfer_is_layouts_and_bodies_among_them(monkeypatch):
     monkeypatch.setattr(transfer, "_STEPS", 12)
     task, told = rl_task("mounts"), Told()
-    found = transfer.transfer_layouts(task, {}, ["random", "greedy"], 2, 1, 3, told)
+    found = transfer.transfer_task(task, {}, ["random", "greedy"], 2, 1, 3, told)
     assert told.done == told.announced > 2
     layouts = evaluation.layouts_of(task, {}, ["random", "greedy"], 2, 3)
     again = transfer.track_layouts(layouts, ["iekf"], 1, 3)
