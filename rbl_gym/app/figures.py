@@ -15,6 +15,7 @@ from rbl_gym.app.consistency import draw_nis
 from rbl_gym.app.reports import turn_open
 from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.rendering.drawing import outline
 from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
 from rbl_gym.studies.replay import Replayed, truth_path
@@ -264,11 +265,8 @@ def _common_legend(figure: Figure, axes: Any) -> None:
 
 
 def ellipse(covariance: FloatArray) -> FloatArray:
-    """Return the outline (60, 2) of the 95 % region of a planar zero-mean Gaussian."""
-    angle = np.linspace(0, 2 * np.pi, 60)
-    values, vectors = np.linalg.eigh(covariance)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    return (vectors @ (np.sqrt(5.991 * values)[:, None] * circle)).T
+    """Return the outline (K, 2) of the 95 % region of a planar zero-mean Gaussian."""
+    return outline(np.eye(2), covariance, 5.991**0.5)
 
 
 @styled

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import box_bounds
-from rbl_gym.geometry.polygons import contains, rectangle
+from rbl_gym.geometry.polygons import contains, rectangle, to_segment
 from rbl_gym.geometry.regions import Shell
 from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.placing.accuracy import Map, accuracy_map
@@ -106,8 +106,7 @@ def mount_shapes(problem: Problem) -> tuple[list[FloatArray], list[FloatArray]]:
         plan = problem.mounts.pieces[:, :6].reshape(-1, 3, 2)
         flat = (plan[:, 1] == plan[:, 2]).all(axis=-1)
         return list(plan[flat, :2]), list(plan[~flat])
-    low, high = problem.mounts.bounds()
-    corners = np.array([low[:2], [high[0], low[1]], high[:2], [low[0], high[1]]])
+    corners = rectangle(*problem.mounts.bounds())
     return list(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)), []
 
 
@@ -131,7 +130,7 @@ def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) 
         return middle
     near = [s.corners for s in blocked if (s.corners.max(0) > low).all()]
     near = [corners for corners in near if (corners.min(0) < high).all()]
-    clear = np.min([_distance(inside, ring) for ring in (polygon, *near)], axis=0)
+    clear = np.min([_to_edge(inside, ring) for ring in (polygon, *near)], axis=0)
     for ring in near:
         clear[contains(ring, inside)] = 0.0
     away = np.linalg.norm((inside - middle) / (high - low), axis=-1)
@@ -142,12 +141,9 @@ def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) 
     return inside[(clear / max(clear.max(), 1e-9) - away).argmax()]
 
 
-def _distance(points: FloatArray, ring: FloatArray) -> FloatArray:
+def _to_edge(points: FloatArray, ring: FloatArray) -> FloatArray:
     """Return the distance from points (P, 2) to the edge of a ring."""
-    away = np.roll(ring, -1, axis=0) - ring
-    off = points[:, None] - ring
-    share = (off * away).sum(-1) / np.maximum((away**2).sum(-1), 1e-12)
-    return np.linalg.norm(off - share.clip(0, 1)[..., None] * away, axis=-1).min(axis=1)
+    return to_segment(points[:, None], ring, np.roll(ring, -1, axis=0)).min(axis=1)
 
 
 def is_far(problem: Problem, anchors: FloatArray) -> bool:
@@ -226,14 +222,33 @@ def values_of(zone: Any, one: Map, field: str) -> FloatArray:
 
 def layer_of(zone: Any, one: Map, values: FloatArray) -> Layer:
     """Return a map with holes filled from nearest neighbours; obstacles are drawn on top."""
+    values, free = filled(values)
+    (left, right), (bottom, top) = (_edges(axis) for axis in (one.columns, one.rows))
+    return Layer(zone, left, right, bottom, top, values, free)
+
+
+def filled(values: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return values (rows, columns) with gaps filled from nearest neighbours, and where not."""
     free = np.isfinite(values)
     if free.any() and not free.all():
         nearest: Any = ndimage.distance_transform_edt(
             ~free, return_distances=False, return_indices=True
         )
         values = values[tuple(nearest)]
-    (left, right), (bottom, top) = (_edges(axis) for axis in (one.columns, one.rows))
-    return Layer(zone, left, right, bottom, top, values, free)
+    return values, free
+
+
+def enlarged(values: FloatArray, zoom: int) -> FloatArray:
+    """Enlarge every cell to zoom x zoom pixels, linear between the centres of cells."""
+    # Ten times as fast as `ndimage.zoom`.
+    for axis in (0, 1):
+        count = values.shape[axis]
+        at = ((np.arange(count * zoom) + 0.5) / zoom - 0.5).clip(0, count - 1)
+        below = np.minimum(at.astype(int), max(count - 2, 0))
+        above = np.minimum(below + 1, count - 1)
+        part = np.expand_dims(at - below, axis=1 - axis)
+        values = (1 - part) * values.take(below, axis) + part * values.take(above, axis)
+    return values
 
 
 def _edges(centres: FloatArray) -> tuple[float, float]:

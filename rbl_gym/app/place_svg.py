@@ -6,18 +6,18 @@ import base64
 import html
 import io
 import json
-import math
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from scipy import ndimage
+from matplotlib.colors import to_hex, to_rgb
 
 from rbl_gym.app import place_answer
 from rbl_gym.app import place_shapes as shapes
 from rbl_gym.app.place_draw import COLOURS, KEPT, MOUNT
 from rbl_gym.app.place_figures import anchor_names, legend_text, map_panels
 from rbl_gym.checks import FloatArray
+from rbl_gym.rendering.drawing import round_number
 from rbl_gym.studies.placing.accuracy import Map
 from rbl_gym.studies.placing.answer import Placed
 
@@ -97,8 +97,7 @@ def plan_part(placed: Placed) -> str:
 def _ruler(edges: FloatArray) -> str:
     """Return a bar of a round length below the plan, and the directions of the axes."""
     width = float(np.ptp(edges[:, 0]))
-    power = 10.0 ** math.floor(math.log10(width / 4))
-    length = power * max(step for step in (1, 2, 5) if step * power <= width / 4)
+    length = round_number(width / 4)
     x, y = edges[0]
     return (
         f'<div class="ruler" style="width: {100 * length / width:.2f}%">{length:g} m</div>'
@@ -247,7 +246,7 @@ def _images(
         parts.append(draw.image(_uri(_picture(image)), box, clip))
         limit = quantity.limit_of(layer.zone)
         if limit is not None and (layer.values > limit).any():
-            beyond = _zoomed(layer.values) > limit
+            beyond = shapes.enlarged(layer.values, _ZOOM) > limit
             stripes = np.zeros((*beyond.shape, 4), np.uint8)
             stripes[beyond & _stripes(beyond.shape)] = 255
             parts.append(draw.image(_uri(_picture(stripes)), box, clip))
@@ -258,19 +257,10 @@ def _verdict_image(layer: shapes.Layer) -> Any:
     """Return an image in two colours, with stripes on the second."""
     if not layer.free.any():
         return _picture(np.full((1, 1, 3), _rgb(shapes.NOTHING), np.uint8))
-    beyond = _zoomed(layer.values) > 1
+    beyond = shapes.enlarged(layer.values, _ZOOM) > 1
     image = np.where(beyond[..., None], _rgb(shapes.BEYOND), _rgb(shapes.WITHIN))
     image[beyond & _stripes(beyond.shape)] = 255
     return _picture(image.astype(np.uint8))
-
-
-def _zoomed(values: FloatArray) -> FloatArray:
-    """Interpolate linearly between the centres."""
-    shape = tuple(_ZOOM * n for n in values.shape)
-    places = [(np.arange(n) + 0.5) / _ZOOM - 0.5 for n in shape]
-    return ndimage.map_coordinates(
-        values, np.meshgrid(*places, indexing="ij"), order=1, mode="nearest"
-    )
 
 
 def _stripes(shape: tuple[int, ...]) -> np.ndarray:
@@ -279,7 +269,7 @@ def _stripes(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _rgb(colour: str) -> np.ndarray:
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+    return np.rint(255 * np.array(to_rgb(colour)))
 
 
 def _picture(pixels: np.ndarray) -> Any:
@@ -308,7 +298,7 @@ def _scale(problem: Any, quantity: shapes.Quantity, span: tuple[float, float]) -
             keys.append(key)
         inner = "".join(f"<span>{key}</span>" for key in keys)
     else:
-        stops = ", ".join(_hex(colormaps[COLOURS](x)) for x in np.linspace(0, 1, 9))
+        stops = ", ".join(to_hex(colormaps[COLOURS](x)) for x in np.linspace(0, 1, 9))
         low, high = (place_answer.digits(value) for value in span)
         inner = (
             f"<span>error of {quantity.name}, one sigma: {low} {quantity.unit}</span>"
@@ -318,10 +308,6 @@ def _scale(problem: Any, quantity: shapes.Quantity, span: tuple[float, float]) -
         if _limit(problem, quantity) is not None:
             inner += "<span>(striped: beyond the requirement)</span>"
     return f'<div class="scale" data-map="{quantity.field}">{inner}</div>'
-
-
-def _hex(colour: Any) -> str:
-    return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
 
 
 def _data(

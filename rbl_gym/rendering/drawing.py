@@ -277,7 +277,7 @@ def body_edges(tags: Any) -> NDArray[np.intp]:
 
 
 def outline(matrix: FloatArray, covariance: FloatArray, radius: float) -> FloatArray:
-    """Return the outline (K, 2) of an ellipsoid of `radius` std, projected by `matrix` (2, 3)."""
+    """Return the outline (K, 2) of an ellipsoid of `radius` std, projected by `matrix` (2, n)."""
     values, vectors = np.linalg.eigh(matrix @ covariance @ matrix.T)
     circle = _circle()
     return radius * (circle * np.sqrt(np.maximum(values, 0))) @ vectors.T

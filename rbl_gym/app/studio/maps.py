@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
+from rbl_gym.app.place_shapes import enlarged, filled
 from rbl_gym.app.studio.state import State, plane
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.placing.accuracy import accuracy
@@ -145,15 +145,9 @@ def _shown(errors: Errors, quantity: str, zone: object) -> FloatArray:
 
 def picture(found: SliceMap) -> np.ndarray:
     """Return pixels (height, width, 4), the upper row first; transparent if there is no value."""
-    values = found.values[::-1]
-    free = np.isfinite(values)
     # Fill the gaps first, so that colours do not run into them.
-    if free.any() and not free.all():
-        nearest: Any = ndimage.distance_transform_edt(
-            ~free, return_distances=False, return_indices=True
-        )
-        values = values[tuple(nearest)]
-    fine, zoom = _enlarged(np.nan_to_num(values), _ZOOM), _ZOOM
+    values, free = filled(found.values[::-1])
+    fine, zoom = enlarged(np.nan_to_num(values), _ZOOM), _ZOOM
     shown = np.empty((*fine.shape, 4), np.uint8)
     if found.quantity is QUANTITIES["requirement"]:
         shown[..., :3] = np.where((fine <= 1)[..., None], WITHIN, BEYOND)
@@ -177,18 +171,6 @@ def _shades() -> np.ndarray:
     at, known = np.linspace(0, 1, _SHADES), np.linspace(0, 1, len(_COLOURS))
     columns = [np.interp(at, known, column) for column in _COLOURS.T]
     return np.round(np.stack(columns, axis=-1)).astype(np.uint8)
-
-
-def _enlarged(values: FloatArray, zoom: int) -> FloatArray:
-    """Enlarge every cell to zoom x zoom pixels, linear between the centres of cells."""
-    for axis in (0, 1):
-        count = values.shape[axis]
-        at = ((np.arange(count * zoom) + 0.5) / zoom - 0.5).clip(0, count - 1)
-        below = np.minimum(at.astype(int), max(count - 2, 0))
-        above = np.minimum(below + 1, count - 1)
-        part = np.expand_dims(at - below, axis=1 - axis)
-        values = (1 - part) * values.take(below, axis) + part * values.take(above, axis)
-    return values
 
 
 def css_gradient() -> str:
