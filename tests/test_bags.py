@@ -61,6 +61,14 @@ class Types:
         stamp = self("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         return self("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
+    def geometry(self, kind: str, values, names: str = "xyz"):
+        numbers = dict(zip(names, map(float, values), strict=True))
+        return self(f"geometry_msgs/msg/{kind}", **numbers)
+
+    def sent(self, topic: str, time_ns: int, name: str, **fields):
+        """A message of a bag: topic, time of recording, message."""
+        return topic, time_ns, self(name, **fields)
+
 
 def types_of(form: str) -> Types:
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
@@ -106,64 +114,39 @@ def flight(types: Types):
     noise = ranging.RangeNoise(0.02)
     rng = np.random.default_rng(1)
     ranges = ranging.simulate(ROOM, tags, *path, noise, rng).ranges
-    quaternions = rotations.quaternion(path.rotation)
-
-    def point(kind, values, names="xyz"):
-        return types(
-            f"geometry_msgs/msg/{kind}", **dict(zip(names, map(float, values), strict=True))
-        )
-
+    quaternions, point = rotations.quaternion(path.rotation), types.geometry
     for k in range(101):
         time = T0 + k * 10**8
         header = types.header(time, "world")
         for m in range(6):
             for n in range(4):
-                yield (
+                yield types.sent(
                     "/uwb_endorange_info",
                     time + 5_000_000,
-                    types(
-                        "uwb_driver/msg/UwbRange",
-                        header=header,
-                        requester_id=200 + n // 2,
-                        antenna=n % 2,
-                        responder_id=100 + m,
-                        distance=float(ranges[k, m, n]),
-                        responder_location=point("Point", ROOM[m]),
-                        rqst_antenna_offset=point("Point", tags[n]),
-                    ),
+                    "uwb_driver/msg/UwbRange",
+                    header=header,
+                    requester_id=200 + n // 2,
+                    antenna=n % 2,
+                    responder_id=100 + m,
+                    distance=float(ranges[k, m, n]),
+                    responder_location=point("Point", ROOM[m]),
+                    rqst_antenna_offset=point("Point", tags[n]),
                 )
         pose = types(
             "geometry_msgs/msg/Pose",
             position=point("Point", path.translation[k]),
             orientation=point("Quaternion", quaternions[k], "wxyz"),
         )
-        message = types("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
-        yield "/mocap/pose", time + 1_000_000, message
+        kind = "geometry_msgs/msg/PoseStamped"
+        yield types.sent("/mocap/pose", time + 1_000_000, kind, header=header, pose=pose)
         turn, force = point("Vector3", (0.1, 0.2, 0.3 + k)), point("Vector3", (0, 0, 9.81))
-        yield (
-            "/imu",
-            time,
-            types(
-                "sensor_msgs/msg/Imu",
-                header=header,
-                angular_velocity=turn,
-                linear_acceleration=force,
-            ),
-        )
+        moved = {"angular_velocity": turn, "linear_acceleration": force}
+        yield types.sent("/imu", time, "sensor_msgs/msg/Imu", header=header, **moved)
         twist = types("geometry_msgs/msg/Twist", linear=force, angular=turn)
         twist = types("geometry_msgs/msg/TwistWithCovariance", twist=twist)
         pose = types("geometry_msgs/msg/PoseWithCovariance", pose=pose)
-        yield (
-            "/odom",
-            time,
-            types(
-                "nav_msgs/msg/Odometry",
-                header=header,
-                child_frame_id="body",
-                pose=pose,
-                twist=twist,
-            ),
-        )
+        moved = {"child_frame_id": "body", "pose": pose, "twist": twist}
+        yield types.sent("/odom", time, "nav_msgs/msg/Odometry", header=header, **moved)
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -220,20 +203,10 @@ def test_every_number_is_in_the_files_as_it_was_sent(tmp_path):
 
 def own_ranges(types: Types, rows):
     """Messages of a type of one's own: (time, here, there, mm, sigma, good)."""
-    for time, here, there, range_mm, sigma, good in rows:
-        yield (
-            "/uwb",
-            T0,
-            types(
-                "my_uwb/msg/Range",
-                header=types.header(time),
-                here=here,
-                there=there,
-                range_mm=range_mm,
-                sigma=sigma,
-                good=good,
-            ),
-        )
+    names = "here", "there", "range_mm", "sigma", "good"
+    for time, *values in rows:
+        fields = dict(zip(names, values, strict=True))
+        yield types.sent("/uwb", T0, "my_uwb/msg/Range", header=types.header(time), **fields)
 
 
 MINE = {"topic": "/uwb", "anchor": "there", "tag": "here", "range": "range_mm", "unit": "mm"}
@@ -329,19 +302,10 @@ def miluv(types: Types):
     """Both ends of a link may be the robot's: tags 10 and 11, anchors 0 and 1, a robot 20."""
     pairs = [(10, 0), (11, 1), (0, 11), (10, 20), (20, 30), (10, 11)]
     for k, (of, to) in enumerate(pairs):
-        yield (
-            "/ifo001/uwb/range",
-            T0,
-            types(
-                "uwb_ros/msg/RangeStamped",
-                header=types.header(T0 + k),
-                range=2.0,
-                from_id=of,
-                to_id=to,
-            ),
-        )
+        fields = {"header": types.header(T0 + k), "range": 2.0, "from_id": of, "to_id": to}
+        yield types.sent("/ifo001/uwb/range", T0, "uwb_ros/msg/RangeStamped", **fields)
         # An altimeter is no radio.
-        yield "/ifo001/hrlv", T0, types("sensor_msgs/msg/Range", range=1.0)
+        yield types.sent("/ifo001/hrlv", T0, "sensor_msgs/msg/Range", range=1.0)
 
 
 def test_the_tags_of_the_body_tell_the_ends_of_a_link(tmp_path):
@@ -361,16 +325,14 @@ def test_the_tags_of_the_body_tell_the_ends_of_a_link(tmp_path):
 def test_ranges_of_sensor_msgs_stand_one_topic_an_anchor(tmp_path):
     types = types_of("mcap")
     messages = [
-        (
+        types.sent(
             f"/uwb/a{m}",
             T0 + k,
-            types(
-                "sensor_msgs/msg/Range",
-                header=types.header(T0 + k, "tag"),
-                range=value,
-                min_range=0.3,
-                max_range=50.0,
-            ),
+            "sensor_msgs/msg/Range",
+            header=types.header(T0 + k, "tag"),
+            range=value,
+            min_range=0.3,
+            max_range=50.0,
         )
         for k, value in enumerate([2.0, 0.1, float("inf"), 60.0, 3.0])
         for m in range(2)
@@ -386,8 +348,8 @@ def transforms(types: Types):
     for k in range(3):
         frames = []
         for child in ("base", "camera"):
-            place = types("geometry_msgs/msg/Vector3", x=float(k), y=1.0, z=0.0)
-            turn = types("geometry_msgs/msg/Quaternion", w=np.cos(0.1 * k), z=np.sin(0.1 * k))
+            place = types.geometry("Vector3", (k, 1, 0))
+            turn = types.geometry("Quaternion", (np.cos(0.1 * k), np.sin(0.1 * k)), "wz")
             transform = types("geometry_msgs/msg/Transform", translation=place, rotation=turn)
             frames.append(
                 types(
@@ -397,7 +359,7 @@ def transforms(types: Types):
                     child_frame_id=child,
                 )
             )
-        yield "/tf", T0, types("tf2_msgs/msg/TFMessage", transforms=frames)
+        yield types.sent("/tf", T0, "tf2_msgs/msg/TFMessage", transforms=frames)
 
 
 def test_truth_from_a_tree_of_frames(tmp_path, capsys):
@@ -421,10 +383,10 @@ def test_truth_from_a_tree_of_frames(tmp_path, capsys):
 def test_a_constant_orientation_is_none(keep, tmp_path):
     """Total stations know places only."""
     types = types_of("ros1")
-    pose = types("geometry_msgs/msg/Pose", orientation=types("geometry_msgs/msg/Quaternion", w=1.0))
+    pose = types("geometry_msgs/msg/Pose", orientation=types.geometry("Quaternion", (1,), "w"))
     kind = "geometry_msgs/msg/PoseStamped"
     messages = [
-        ("/leica", T0, types(kind, header=types.header(T0 + k), pose=pose)) for k in range(3)
+        types.sent("/leica", T0, kind, header=types.header(T0 + k), pose=pose) for k in range(3)
     ]
     log = write_bag(tmp_path / "leica", "ros1", types, messages)
     truth = {"orientation": "pose.orientation", "topic": "/leica"} if keep else {}
@@ -438,23 +400,17 @@ def test_a_constant_orientation_is_none(keep, tmp_path):
 def viral(types: Types, places, offsets):
     """Ranges with places of the anchor and of the antenna beside them."""
     for k, (place, offset) in enumerate(zip(places, offsets, strict=True)):
-        place, offset = (
-            types("geometry_msgs/msg/Point", x=float(p[0]), y=float(p[1]), z=float(p[2]))
-            for p in (place, offset)
-        )
-        yield (
+        yield types.sent(
             "/uwb",
             T0,
-            types(
-                "uwb_driver/msg/UwbRange",
-                header=types.header(T0 + k),
-                requester_id=200,
-                antenna=0,
-                responder_id=100 + k % 2,
-                distance=2.0,
-                responder_location=place,
-                rqst_antenna_offset=offset,
-            ),
+            "uwb_driver/msg/UwbRange",
+            header=types.header(T0 + k),
+            requester_id=200,
+            antenna=0,
+            responder_id=100 + k % 2,
+            distance=2.0,
+            responder_location=types.geometry("Point", place),
+            rqst_antenna_offset=types.geometry("Point", offset),
         )
 
 
@@ -503,7 +459,7 @@ def test_clocks_that_differ_and_stamps_that_are_missing(tmp_path):
     types = types_of("ros1")
     messages = [
         *own_ranges(types, [(T0 + k - 3 * 10**9, 7, 1, 900, 0.1, True) for k in range(3)]),
-        *(("/imu", T0 + k, types("sensor_msgs/msg/Imu")) for k in range(3)),
+        *(types.sent("/imu", T0 + k, "sensor_msgs/msg/Imu") for k in range(3)),
     ]
     log = write_bag(tmp_path / "own", "ros1", types, sorted(messages, key=lambda m: m[1]))
     result = recordings.convert_bag(log, tmp_path / "out", {"ranges": MINE})
@@ -516,7 +472,7 @@ def test_clocks_that_differ_and_stamps_that_are_missing(tmp_path):
 def test_one_of_several_topics_is_not_guessed(tmp_path):
     types = types_of("ros1")
     messages = [
-        (topic, T0 + k, types("sensor_msgs/msg/Imu", header=types.header(T0 + k)))
+        types.sent(topic, T0 + k, "sensor_msgs/msg/Imu", header=types.header(T0 + k))
         for k in range(3)
         for topic in ("/a/imu", "/b/imu")
     ]

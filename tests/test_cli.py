@@ -386,9 +386,9 @@ def test_numbers_out_of_range_are_usage_errors(bad, capsys):
     assert "must be" in capsys.readouterr().err
 
 
-def test_the_option_of_version_0_1_for_squares_still_works(capsys):
+def test_an_option_of_the_filter_goes_before_the_setting(capsys):
     log = ROOT / "examples" / "log"
-    command = ["replay", "--filter", "iekf", "--json"]
+    command = ["replay", "--json"]
     for name in ("ranges", "anchors", "tags"):
         command += [f"--{name}", str(log / f"{name}.csv")]
     assert main([*command, "--filter", "iekf/robust=false"]) == 0

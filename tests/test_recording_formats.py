@@ -11,19 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rbl_gym.recordings import Files, Format, Recording, Report, read_recording, read_runs
-from tests.test_recordings import ANCHORS, LONG, TAGS, TRUTH, WIDE, assert_same, write_and_read
-
-
-def write(folder: Path, **texts: str) -> dict[str, Any]:
-    """Files of these texts, by their names."""
-    for name, text in texts.items():
-        (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
-    return {name: folder / f"{name}.csv" for name in texts}
-
-
-def read(folder: Path, ranges: str = LONG, **texts: str) -> Recording:
-    texts = {"ranges": ranges, "anchors": ANCHORS, "tags": TAGS, **texts}
-    return read_recording(Files(**write(folder, **texts)))
+from tests.test_recordings import ANCHORS, LONG, TAGS, TRUTH, WIDE, assert_same, write
+from tests.test_recordings import write_and_read as read
 
 
 def read_as(folder: Path, ranges: str, **options) -> Recording:
@@ -42,32 +31,6 @@ def many(count: int = 20, step: float = 0.1, **changes: Any) -> str:
     """A long log of one link, `count` rows; `changes` are cells by row, ``r3="0"``."""
     rows = [f"{step * k:.6g},A,1,{changes.get(f'r{k}', 2.5)}" for k in range(count)]
     return "\n".join(["t,anchor,tag,range", *rows, ""])
-
-
-GOOD = "t,anchor,tag,range\n0.0,A,1,2.5\n0.0,A,left,2.25\n0.0,C,1,3.0\n0.1,B,left,1.5\n"
-SPELLINGS = {
-    "semicolons": GOOD.replace(",", ";"),
-    "decimal commas": GOOD.replace(",", ";").replace(".", ","),
-    "tabs": GOOD.replace(",", "\t"),
-    "tabs and decimal commas": GOOD.replace(",", "\t").replace(".", ","),
-    "white space": GOOD.replace(",", "   "),
-    "header in a comment": "# made by a logger, 2024\n#" + GOOD,
-    "header in a comment, spaces": "# " + GOOD.replace(",", " "),
-    "crlf and semicolons": GOOD.replace(",", ";").replace("\n", "\r\n"),
-    "delimiter at the end": GOOD.replace("\n", ",\n"),
-    "delimiter at the end of rows": GOOD.replace("\n", ",\n").replace("range,", "range"),
-    "other names": GOOD.replace("t,anchor,tag,range", "Timestamp,anchor_id,tag_id,distance"),
-    "units in the header": GOOD.replace("t,", "time [s],", 1).replace("range", "range (m)"),
-    "ids as floats": GOOD.replace(",1,", ",1.0,"),
-    "ids in capitals": GOOD.replace("left", "LEFT").replace("A", "a"),
-    "a spreadsheet's first line": "SEP=;\r\n" + GOOD.replace(",", ";").replace("\n", "\r\n"),
-    "more columns": GOOD.replace("\n", ",-80\n").replace("range,-80", "range,rssi"),
-}
-
-
-@pytest.mark.parametrize("spelling", SPELLINGS)
-def test_spellings_of_one_log(tmp_path, spelling):
-    assert_same(read(tmp_path, SPELLINGS[spelling]), read(tmp_path, GOOD))
 
 
 def test_columns_are_mapped_and_others_are_named_once(tmp_path):
@@ -590,7 +553,7 @@ def test_formats_that_do_not_fit(tmp_path, options, message):
 
 
 def test_a_recording_made_of_arrays_has_an_empty_report(tmp_path):
-    log = write_and_read(tmp_path)
+    log = read(tmp_path)
     bare = Recording(*log[: Recording._fields.index("report")])  # pyright: ignore[reportArgumentType]
     assert bare.report == Report() == Report(0, {}, 0, ())
     assert bare.anchors_by_epoch.shape == (2, 3, 3)

@@ -39,14 +39,18 @@ PLANAR = "t,x,y,yaw_deg\n0,1,2,90\n1,2,2,180\n"
 CALIBRATION = "anchor,tag,bias_m,slope,sigma_m\nA,1,0.5,0.25,0.01\nC,1,3.5,0,\n"
 
 
-def write_and_read(folder: Path, ranges: str | bytes = LONG, **texts: str | bytes) -> Recording:
-    """The recording of these texts, each written to `folder` as the file of its name."""
-    texts = {"ranges": ranges, "anchors": ANCHORS, "tags": TAGS} | texts
+def write(folder: Path, **texts: str | bytes) -> dict[str, Any]:
+    """Files of these texts, by their names."""
     for name, text in texts.items():
         data = text.encode() if isinstance(text, str) else text
         (folder / f"{name}.csv").write_bytes(data)
-    files: dict[str, Any] = {name: folder / f"{name}.csv" for name in texts}
-    return read_recording(Files(**files))
+    return {name: folder / f"{name}.csv" for name in texts}
+
+
+def write_and_read(folder: Path, ranges: str | bytes = LONG, **texts: str | bytes) -> Recording:
+    """The recording of these texts, each written to `folder` as the file of its name."""
+    texts = {"ranges": ranges, "anchors": ANCHORS, "tags": TAGS} | texts
+    return read_recording(Files(**write(folder, **texts)))
 
 
 def poses_at(*args: Any, **options: Any) -> Any:
@@ -80,20 +84,36 @@ def test_wide_equals_long(tmp_path):
     assert_same(write_and_read(tmp_path, WIDE), write_and_read(tmp_path, LONG))
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        pytest.param(LONG.encode("utf-8-sig"), id="byte order mark"),
-        pytest.param(LONG.replace("\n", "\r\n"), id="crlf"),
-        pytest.param("# a log\n\n" + LONG.replace("0.1,B", "  # moved\n \n0.1,B"), id="comments"),
-        pytest.param(LONG.replace(",", " ,  "), id="spaces"),
-        pytest.param(LONG.replace("left", '"left"'), id="quotes"),
-        pytest.param(LONG.rstrip("\n"), id="no newline at the end"),
-        pytest.param(LONG + "0.1,A,1,\n", id="empty range"),
-    ],
-)
-def test_spellings_of_one_log(tmp_path, text):
-    assert_same(write_and_read(tmp_path, text), write_and_read(tmp_path, LONG))
+SPELLINGS: dict[str, str | bytes] = {
+    "byte order mark": LONG.encode("utf-8-sig"),
+    "crlf": LONG.replace("\n", "\r\n"),
+    "comments": "# a log\n\n" + LONG.replace("0.1,B", "  # moved\n \n0.1,B"),
+    "spaces": LONG.replace(",", " ,  "),
+    "quotes": LONG.replace("left", '"left"'),
+    "no newline at the end": LONG.rstrip("\n"),
+    "empty range": LONG + "0.1,A,1,\n",
+    "semicolons": LONG.replace(",", ";"),
+    "decimal commas": LONG.replace(",", ";").replace(".", ","),
+    "tabs": LONG.replace(",", "\t"),
+    "tabs and decimal commas": LONG.replace(",", "\t").replace(".", ","),
+    "white space": LONG.replace(",", "   "),
+    "header in a comment": "# made by a logger, 2024\n#" + LONG,
+    "header in a comment, spaces": "# " + LONG.replace(",", " "),
+    "crlf and semicolons": LONG.replace(",", ";").replace("\n", "\r\n"),
+    "delimiter at the end": LONG.replace("\n", ",\n"),
+    "delimiter at the end of rows": LONG.replace("\n", ",\n").replace("range,", "range"),
+    "other names": LONG.replace("t,anchor,tag,range", "Timestamp,anchor_id,tag_id,distance"),
+    "units in the header": LONG.replace("t,", "time [s],", 1).replace("range", "range (m)"),
+    "ids as floats": LONG.replace(",1,", ",1.0,"),
+    "ids in capitals": LONG.replace("left", "LEFT").replace("A", "a"),
+    "a spreadsheet's first line": "SEP=;\r\n" + LONG.replace(",", ";").replace("\n", "\r\n"),
+    "more columns": LONG.replace("\n", ",-80\n").replace("range,-80", "range,rssi"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_spellings_of_one_log(tmp_path, spelling):
+    assert_same(write_and_read(tmp_path, SPELLINGS[spelling]), write_and_read(tmp_path, LONG))
 
 
 def test_first_column_may_be_called_id(tmp_path):
