@@ -71,6 +71,13 @@ def reference_filter(name: str, track: Any, **options: Any) -> Any:
     )
 
 
+def over_bound(error: np.ndarray, bound: np.ndarray) -> list[float]:
+    """RMSE of rotation and translation (..., 6) over their bound (..., 6, 6), pooled."""
+    square, variance = np.square(error), np.diagonal(bound, axis1=-2, axis2=-1)
+    pairs = ((square[..., k], variance[..., k]) for k in (slice(0, 3), slice(3, 6)))
+    return [float(np.sqrt(a.sum(-1).mean() / b.sum(-1).mean())) for a, b in pairs]
+
+
 def assert_bound(P: np.ndarray, Q: np.ndarray, want: dict[str, float]) -> None:
     """Assert the three figures of a bound (6, 6) in a reference file."""
     angle = np.rad2deg(metrics.expected_mean_angular_error(P, Q))

@@ -14,7 +14,7 @@ from rbl_gym.estimators.locating.doa_global import three_point_depths
 from rbl_gym.estimators.locating.doa_newton import newton_iteration, unit_quaternion
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import bearing, ranging
-from tests.helpers import load
+from tests.helpers import load, over_bound
 
 TAGS = bodies.doa2019()
 T = np.array([5.0, 5.0, 3.0])
@@ -37,12 +37,7 @@ def trials(count, sigma_deg, seed=0, turned=True, tags=TAGS):
 def ratios(found, rotation, noise):
     """RMSE over the bound of rotation and translation."""
     error = metrics.pose_error(found.rotation, found.translation, rotation, T)
-    P = doa_bounds.doa_crb(TAGS, rotation, T, noise)
-    variance = np.diagonal(P, axis1=-2, axis2=-1)
-    return [
-        np.sqrt((error[:, block] ** 2).sum(-1).mean() / variance[:, block].sum(-1).mean())
-        for block in (slice(0, 3), slice(3, 6))
-    ]
+    return over_bound(error, doa_bounds.doa_crb(TAGS, rotation, T, noise))
 
 
 # --- the reference ----------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from rbl_gym.estimators.locating import maximum_likelihood
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import noise_laws, ranging
 from rbl_gym.worlds import scenes
-from tests.helpers import assert_bound, load, random_world, simulate, with_kernels
+from tests.helpers import assert_bound, load, over_bound, random_world, simulate, with_kernels
 
 BODY = bodies.icassp2013()
 SCENE = scenes.SCENES["icassp2013"]
@@ -41,12 +41,7 @@ def paper_world(trials, db, seed, low=-50, high=50, n_anchors=10):
 def ratios(found, bound):
     """RMSE of rotation and translation over their bound, pooled over the trials."""
     error = metrics.pose_error(found.rotation, found.translation, ROTATION, TRANSLATION)
-    return [
-        np.sqrt(
-            (error[:, part] ** 2).sum() / np.trace(bound[:, part, part], axis1=1, axis2=2).sum()
-        )
-        for part in (slice(0, 3), slice(3, 6))
-    ]
+    return over_bound(error, bound)
 
 
 # --- the reference implementation -----------------------------------------------------------

@@ -14,7 +14,7 @@ from rbl_gym.estimators.filter import inverse
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
-from tests.helpers import load, random_world, reference_filter, simulate
+from tests.helpers import load, over_bound, random_world, reference_filter, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
@@ -135,9 +135,7 @@ def test_reaches_the_posterior_bound_and_is_consistent():
     belief = filter.belief(filter.update(prior, ranges, anchors))
     error = metrics.pose_error(belief.rotation, belief.translation, rotation, translation)
     bound = bounds.pose_crb(anchors, tags, rotation, translation, NOISE, np.diag(std**-2.0))
-    for block in (slice(0, 3), slice(3, 6)):
-        ratio = np.sqrt((error[:, block] ** 2).sum(1).mean() / np.trace(bound[block, block]))
-        assert abs(ratio - 1) < 3 / np.sqrt(2 * trials)
+    assert over_bound(error, bound) == pytest.approx([1, 1], abs=3 / np.sqrt(2 * trials))
     nees = metrics.nees(error, belief.covariance).mean()
     assert abs(nees - 6) < 4 * np.sqrt(12 / trials)
 

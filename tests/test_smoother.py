@@ -32,7 +32,7 @@ from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.motion.unknown_twist import WanderingTwist, simulate_wandering
 from rbl_gym.worlds.scenes import SCENES
-from tests.helpers import random_world, smoothed_trials
+from tests.helpers import over_bound, random_world, smoothed_trials
 
 WANDER = WanderingTwist(0.4, 1.0, 0.3, 0.8)
 PROCESS = ProcessNoise(0.05, 0.1)
@@ -315,11 +315,8 @@ def test_ranges_with_a_time_each_and_a_deviation_each():
 def test_reaches_its_bound_with_honest_beliefs(name, seed):
     found, error, limit = smoothed_trials(SCENES[name], 40, seed)
     assert found.converged.all()
-    for axes in (slice(0, 3), slice(3, 6)):
-        claimed = np.diagonal(limit, axis1=-2, axis2=-1)[..., axes].sum(axis=-1).mean()
-        ratio = np.square(error[..., axes]).sum(axis=-1).mean() / claimed
-        # 40 trials of 101 epochs, of which some ten are independent of each other: 1 +- 0.04.
-        assert 0.88 < ratio < 1.12
+    # 40 trials of 101 epochs, of which some ten are independent of each other: 1 +- 0.02.
+    assert over_bound(error, limit) == pytest.approx([1, 1], abs=0.06)
     assert 0.9 < metrics.nees(error, found.covariance).mean() / 6 < 1.1
     assert 0.97 < found.squares.sum() / found.freedom.sum() < 1.03
 
