@@ -45,6 +45,7 @@ def said(capsys, *arguments):
         (["bounds", "--scene", "hal"], "--scene must be one of .* did you mean 'hall'"),
         (["place", "uwb_room", "--fewest"], "--fewest needs a requirement"),
         (["place", "uwb_room", "--anchors", "x"], "--anchors: must be N or A..B, .* got 'x'"),
+        (["convert", "--list", "x.bag"], "LOG must be given, before --list"),
         (["plac"], "did you mean 'place'"),
         (["train", "uwb_rom"], "did you mean 'uwb_room'"),
     ],

@@ -176,7 +176,11 @@ ID = "RBL/AnchorPlacement-v0"
         (["uwb_room", "--watch", "--filter", "kalmann"], "filter must be one of"),
         (["--env", "RBL/Nothing-v0"], "--env RBL/Nothing-v0"),
         (["--policy", "none.npz"], "none.npz"),
-        (["--policy", "none.npz", "--env", ID, "--reference", "ring"], "--reference must be left"),
+        (
+            ["--policy", "none.npz", "--env", ID, "--reference", "ring"],
+            "--reference needs --policy",
+        ),
+        (["--env", ID, "--reference", "ring"], "--reference needs --policy without --env"),
     ],
 )
 def test_the_command_says_what_is_wrong(options, says, capsys):

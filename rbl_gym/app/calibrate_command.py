@@ -191,7 +191,7 @@ _WITHOUT = {
 def _calibrate(options: argparse.Namespace) -> int:
     for name in ("calibration", "directions"):
         if getattr(options, name) is not None:
-            raise ValueError(f"calibrate needs ranges without corrections: leave out --{name}")
+            raise ValueError(f"calibrate estimates the corrections itself: leave out --{name}")
     if options.imu_frame is not None:
         raise ValueError("calibrate estimates the axes of --imu: leave out --imu-frame")
     if options.imu is not None and not options.truth:

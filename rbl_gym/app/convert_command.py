@@ -28,7 +28,7 @@ def add_convert(commands: Any) -> None:
     )
     convert.add_argument(
         "log",
-        nargs="+",
+        nargs="*",
         metavar="LOG",
         help="a .bag file of ROS 1 (or several that follow each other), the folder of a ROS 2 bag, "
         "or a .db3 or .mcap file",
@@ -64,6 +64,8 @@ def add_convert(commands: Any) -> None:
 
 
 def _convert(options: argparse.Namespace) -> int:
+    if not options.log:
+        raise ValueError("LOG must be given, before --list: rbl-gym convert LOG --list")
     require("rosbags", "bags", "reading bags")
     from rbl_gym.app import convert_report
     from rbl_gym.recordings import bag_profiles, bags

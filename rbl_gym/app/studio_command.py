@@ -100,6 +100,8 @@ def _studio(options: argparse.Namespace) -> int:
     from rbl_gym.app import studio
     from rbl_gym.app.studio.opening import Options
 
+    if options.reference and (options.env or not options.policy):
+        raise ValueError("--reference needs --policy without --env: only tasks have references")
     shown = {}
     if any((options.ranges, options.watch, options.env, options.policy)):
         what, beside = _program(options), None
@@ -180,8 +182,6 @@ def _learned(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
     from rbl_gym.worlds.scene_source import read_scene
 
     if options.env:
-        if options.reference:
-            raise ValueError("--reference must be left out with --env: only tasks have references")
         env = _env(options)
         return learned.played_program(options.policy, env, labels or None, options.seed)
     scene = read_scene(options.scene) if options.scene else None
