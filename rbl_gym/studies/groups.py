@@ -205,16 +205,16 @@ def each(log: Reading) -> Iterator[Reading]:
         links (E, M, N), twist (E, 6) and dt (E,), with 0 s for no interval. The noise law may be a
         `LinkNoise` with standard deviations (E, M, N).
     """
-    whole = np.ones(len(log.ranges), np.bool_) if log.links is None else log.links.all(axis=(1, 2))
-    for k, (complete, dt) in enumerate(zip(whole.tolist(), log.dt.tolist(), strict=True)):  # pyright: ignore[reportAttributeAccessIssue]
+    for k in range(len(log.ranges)):
         one = _part(log, k)
+        dt, complete = float(one.dt), one.links is None or one.links.all()
         links, twist = None if complete else one.links, one.twist if dt > 0 else None
         yield one._replace(links=links, twist=twist, dt=dt)
 
 
 def _part(log: Reading, index: Any) -> Reading:
     """Return a part of a log, or one of its epochs."""
-    links, twist, dt = (None if a is None else a[index] for a in (log.links, log.twist, log.dt))  # pyright: ignore[reportIndexIssue, reportOptionalSubscript]
-    law = log.noise
+    links, twist = (None if a is None else a[index] for a in (log.links, log.twist))
+    law, dt = log.noise, np.broadcast_to(log.dt, len(log.ranges))[index]
     law = LinkNoise(law.std_m[index]) if isinstance(law, LinkNoise) else law
     return Reading(log.ranges[index], log.anchors[index], links, law, twist, dt)  # pyright: ignore[reportArgumentType]
