@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import (
+    HUGE,
     BoolArray,
     FloatArray,
     all_finite,
@@ -258,16 +259,18 @@ class KalmanFamily:
         if (
             mean.ndim != 2
             or P.ndim != 2
-            or np.ndim(self.weights) > 2
-            or np.shape(ranges)[:-2] != mean.shape[:1]
+            or type(ranges) is not np.ndarray
+            or ranges.shape[:-2] != mean.shape[:1]
             or not len(mean)
             or links_of_plain_epoch(ranges[0], anchors, self.tags, ()) is None
-            or not all_finite(anchors)
+            or not np.vdot(anchors, anchors) < HUGE
             or engine_for(self.engine, state=mean.shape[:1]) is not Batched
         ):
             return None
         self._check_determined(state, anchors)
         weights = self._fixed_weights(ranges)
+        if weights.ndim > 2:
+            return None
         P = update_covariance(P, anchors, self.tags, weights)
         mean = update_means(mean, P, ranges, anchors, self.tags, weights)
         # The general code raises the error of a range.

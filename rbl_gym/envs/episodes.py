@@ -30,8 +30,9 @@ class EpisodeStore:
         self._scene = scene
         self._num_envs = num_envs
         self._draws = simulation.empty_draws(scene, min(num_envs, _BLOCK))
-        # The fields of `simulation.Epoch`.
+        # The fields of `simulation.Epoch`; the first ones are views of the motion.
         self._timed: list[FloatArray | None] = []
+        self._moved: list[FloatArray] = []
 
     @property
     def empty(self) -> bool:
@@ -62,21 +63,19 @@ class EpisodeStore:
         }
 
     def _motion_of(self, rows: slice | np.ndarray) -> simulation.Motion | None:
-        """Return the motion (b, T + 1, ...) of b worlds; of a slice, views of the arrays."""
+        """Return arrays for the motion of b worlds, (b, ...); of a slice, views."""
         if not self._timed:
             return None
-        return simulation.Motion(*[np.swapaxes(field[:, rows], 0, 1) for field in self._timed[:3]])  # pyright: ignore
+        return simulation.Motion(*[np.swapaxes(field[:, rows], 0, 1) for field in self._moved])
 
     def _write(self, worlds: np.ndarray, fields: simulation.Epoch) -> None:
         """Store the epochs of some worlds; NumPy skips the assignment of a view to itself."""
         if not self._timed:
-            # Without the spare worlds, epochs of 1024 worlds would share lines of the cache.
-            room = self._num_envs + self._num_envs // 256
+            self._moved = [self._empty(shape) for shape in simulation.motion_shapes(self._scene)]
+            epochs = len(self._moved[2])
             self._timed = [
-                None
-                if field is None
-                else np.empty((field.shape[1], room, *field.shape[2:]))[:, : self._num_envs]
-                for field in fields
+                *(held[-epochs:] for held in self._moved),
+                *(None if one is None else self._empty(one.shape[1:]) for one in fields[3:]),
             ]
         for k, (stored, field) in enumerate(zip(self._timed, fields, strict=True)):
             if stored is None or field is None:
@@ -86,6 +85,11 @@ class EpisodeStore:
             for first in range(0, len(worlds), few):
                 part = slice(first, first + few)
                 stored[:, rows_of(worlds[part])] = np.swapaxes(field[part], 0, 1)
+
+    def _empty(self, shape: tuple[int, ...]) -> FloatArray:
+        # Without the spare worlds, epochs of 1024 worlds would share lines of the cache.
+        room = self._num_envs + self._num_envs // 256
+        return np.empty((shape[0], room, *shape[1:]))[:, : self._num_envs]
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """Return the epochs (B,) of all worlds; the random numbers must not be written to."""

@@ -183,7 +183,7 @@ def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
 def build_episode(scene: Scene, draws: Draws, out: Motion | None = None) -> Episode:
     """Return the episodes of these random numbers, batched over their leading axes.
 
-    `out` are arrays for the motion (..., T + 1, ...), in any memory order; None: new ones.
+    `out` are arrays for the motion, in any memory order, as `motion_shapes` says; None: new ones.
     """
     batch = draws.normals.shape[:-1]
     start, process, ranges, held, felt, common, surveyed = _split(
@@ -194,16 +194,14 @@ def build_episode(scene: Scene, draws: Draws, out: Motion | None = None) -> Epis
     steps = scene.steps_of_motion
     process = process.reshape((*batch, steps, 6))
     if out is None:
-        out = Motion(*(np.empty((*batch, scene.steps + 1, *size)) for size in ((3, 3), (3,), (6,))))
+        out = Motion(*(np.empty((*batch, *shape)) for shape in motion_shapes(scene)))
     inertial = (None, None, None)
     if scene.inertial is not None:
         track = inertial_motion.fly(scene, trajectory, process, felt)
         path, twists = motion.Path(track.rotation, track.translation), track.twists
         inertial = track.velocity, track.readings, track.bias
     else:
-        # With a step before epoch 0 the path is longer than its part in `out`.
-        held = motion.Path(*out[:2]) if steps == scene.steps else None
-        path = motion.simulate(trajectory, scene.dt, scene.process, process, held)
+        path = motion.simulate(trajectory, scene.dt, scene.process, process, motion.Path(*out[:2]))
         twists = trajectory.twists
     first_known = scene.steps + 1 - twists.shape[-2]
     out.twist[..., :first_known, :] = 0.0
@@ -218,9 +216,8 @@ def build_episode(scene: Scene, draws: Draws, out: Motion | None = None) -> Epis
     else:
         offset = np.sqrt(covariance.diagonal()) * start[..., 7:]
         prior = motion.propagate(rotation, translation, offset, 1.0)
-    before = path.translation.shape[-2] - scene.steps - 1
-    out.rotation[...] = path.rotation[..., before:, :, :]
-    out.translation[...] = path.translation[..., before:, :]
+    before = steps - scene.steps
+    out = Motion(path.rotation[..., before:, :, :], path.translation[..., before:, :], out.twist)
     if scene.anchors is None:
         spots = spots.reshape((*batch, scene.n_anchors, 3))
         if scene.anchor_start_m is None:
@@ -244,6 +241,15 @@ def build_episode(scene: Scene, draws: Draws, out: Motion | None = None) -> Epis
         survey = survey.reshape((*batch, 1, scene.n_anchors, 3))
         survey = np.broadcast_to(survey, (*batch, scene.steps + 1, scene.n_anchors, 3))
     return Episode(*out, *random, *inertial, offsets, survey, *prior, covariance, anchors)
+
+
+def motion_shapes(scene: Scene) -> tuple[tuple[int, ...], ...]:
+    """Return shapes of the arrays of `Motion` in which an episode is built.
+
+    The poses have an epoch more than the twists if there is a step before epoch 0.
+    """
+    poses = scene.steps_of_motion + 1
+    return (poses, 3, 3), (poses, 3), (scene.steps + 1, 6)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
