@@ -198,3 +198,6 @@ def test_a_policy_that_does_not_fit_is_named():
     ):
         with pytest.raises(ValueError, match="policy 'mine' does not fit: it was trained on"):
             policies.check_fit(wrong, "mine", envs)
+    envs.single_observation_space = gym.spaces.Box(0.0, 1.0, (18, 2))
+    with pytest.raises(ValueError, match=r"task has an observation of shape \(18, 2\) and 12 out"):
+        policies.check_fit(random_policy("multi-binary", sizes=(18, 4, 12)), "mine", envs)

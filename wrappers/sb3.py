@@ -12,8 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from rbl_gym.extras import require
 
 require("stable_baselines3", "rl", "Sb3VecEnv")
-from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
-    VecEnv,  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402  # pyright: ignore[reportMissingImports]
+    VecEnv,
     VecEnvIndices,
 )
 

@@ -278,8 +278,9 @@ def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
     return kind, int(np.prod(space.shape or ()))
 
 
-def _spaces(entries: int | None, kind: str, outputs: int) -> str:
-    return f"an observation of {entries} numbers and {outputs} outputs for {kind!r} actions"
+def _spaces(told: tuple[Any, ...]) -> str:
+    *shape, kind, outputs = told
+    return f"an observation of shape {tuple(shape)} and {outputs} outputs for {kind!r} actions"
 
 
 def check_fit(policy: Any, label: str, envs: Any) -> None:
@@ -300,4 +301,4 @@ def check_fit(policy: Any, label: str, envs: Any) -> None:
     asked = (*(seen.shape or (None,)), *kind_and_outputs(acted))
     got = (policy.n_inputs, policy.kind, len(policy.biases[-1]))
     if got != asked:
-        raise ValueError(f"{trained}, with {_spaces(*got)}, but this task has {_spaces(*asked)}")
+        raise ValueError(f"{trained}, with {_spaces(got)}, but this task has {_spaces(asked)}")
