@@ -359,6 +359,18 @@ def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
     assert "greedy-with-map" in capsys.readouterr().out
 
 
+def test_without_cmaes_its_references_are_skipped(monkeypatch, capsys):
+    monkeypatch.setattr(evaluation, "find_spec", lambda name: None)
+    arguments = ["evaluate", "auv_buoys", "--worlds", "2", "--references", "ring", "--json"]
+    assert main(arguments) == 0
+    told = capsys.readouterr()
+    assert "skipped: one-for-all, cma-es: pip install 'rbl-gym[placement]'" in told.err
+    result = json.loads(told.out)
+    assert list(result["methods"]) == ["random", "ring", "gradient", "hybrid", "best-known"]
+    assert result["best_of"] == ["gradient", "hybrid"]
+    assert result["skipped"] == ["one-for-all", "cma-es"]
+
+
 @needs("cmaes")
 def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(transfer, "_STEPS", 14)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -190,8 +191,13 @@ def _evaluate(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import evaluation
 
     task, title, loaded = _played(options)
-    names = _references(options, task, evaluation.references(task))
-    _require_searches({*names, *evaluation.strongest(task)})
+    named = _references(options, task, [])
+    _require_searches({*named})
+    if skipped := evaluation.skipped_references(task, named):
+        print(
+            f"skipped: {', '.join(skipped)}: pip install 'rbl-gym[placement]'", file=sys.stderr
+        )
+    names = named or None
     with progress(title) as advance:
         result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
     result["task"] = title
@@ -231,8 +237,9 @@ def _references(options: argparse.Namespace, task: RlTask, default: list[str]) -
 
 def _require_searches(names: set[str]) -> None:
     """Raise MissingExtraError for a reference whose library is missing, before the others run."""
-    if "cma-es" in names:
-        require("cmaes", "placement", "the reference cma-es")
+    for name in ("cma-es", "one-for-all"):
+        if name in names:
+            require("cmaes", "placement", f"the reference {name}")
 
 
 def _policies(paths: list[str]) -> dict[str, PolicyLike]:

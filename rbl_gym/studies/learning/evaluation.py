@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,8 @@ __all__ = ["Layouts", "evaluate", "held_out_returns", "layouts_of", "references"
 
 # The reference with one layout for all contexts, and the number of contexts for its search.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
+# References that need the package cmaes.
+_OF_CMAES = (_ONE_LAYOUT, "cma-es")
 # Row of the best layouts of the strongest searches.
 BEST_KNOWN = "best-known"
 # Random layouts of each context, and gradient evaluations that refine a policy's layout.
@@ -49,6 +52,13 @@ def references(task: RlTask) -> list[str]:
         one = [] if "scenes" in task.arguments else [_ONE_LAYOUT]
         return [*layouts.LAYOUTS, *one, *others, *last]
     return list(_controllers(task))
+
+
+def skipped_references(task: RlTask, named: Sequence[str]) -> list[str]:
+    """Return the references that are left out: not named, and without the package they need."""
+    if find_spec("cmaes") is not None:
+        return []
+    return [name for name in references(task) if name in _OF_CMAES and name not in named]
 
 
 def strongest(task: RlTask) -> list[str]:
@@ -95,7 +105,8 @@ def evaluate(
         also refines each by a few gradient steps, as ``LABEL + gradient``.
     names
         Names of `references`; None: all. ``random`` and the strongest are always included. If there
-        are several strongest, ``best-known`` is the best of them in each world.
+        are several strongest, ``best-known`` is the best of them in each world. Without the package
+        cmaes, references that need it and are not named are left out.
     worlds, seed
         Number and seed of the worlds.
     advance
@@ -122,9 +133,10 @@ def evaluate(
     ['random', 'nearest', 'greedy-with-map', 'policy']
     """
     task, policies = task_of(task), policies_by_label(policies)
-    known = references(task)
+    skipped = skipped_references(task, names or ())
+    known = [name for name in references(task) if name not in skipped]
     names = [check_one_of("reference", name, known) for name in (known if names is None else names)]
-    best_of = strongest(task)
+    best_of = [name for name in strongest(task) if name not in skipped]
     names = [name for name in known if name in {*names, known[0], *best_of}]
     play = _placement_losses if task.env_id == "RBL/AnchorPlacement-v0" else _loop_losses
     losses = play(task, policies, names, worlds, seed, advance)
@@ -132,7 +144,7 @@ def evaluate(
     if len(best_of) > 1:
         best = BEST_KNOWN
         losses[best] = np.min([losses[name] for name in best_of], axis=0)
-    rng = np.random.default_rng([seed, len(known) + 1])
+    rng = np.random.default_rng([seed, len(references(task)) + 1])
     resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))
     methods: dict[str, dict[str, Any]] = {
         name: _figures(loss, losses["random"], losses[best], resamples)
@@ -145,6 +157,7 @@ def evaluate(
         "seed": seed,
         "best_reference": best,
         "best_of": best_of,
+        "skipped": skipped,
         "methods": methods,
     }
 
