@@ -5,9 +5,11 @@ import pytest
 
 pytest.importorskip("shapely", reason="needs the extra placement")
 
-from rbl_gym.app import place_answer, place_figures, place_svg
+from rbl_gym.app import place_answer, place_figures, place_report, place_svg
+from rbl_gym.app import place_shapes as shapes
 from rbl_gym.app.place_notes import deciding_notes, nees_notes, usual_notes
 from rbl_gym.placement import scene_files
+from rbl_gym.studies.placing import accuracy
 from rbl_gym.studies.placing.answer import Question, place_anchors
 from rbl_gym.studies.placing.judging import judge, short_row
 
@@ -107,8 +109,31 @@ def test_pictures_say_which_anchors_they_assume(survive):
     figure = place_figures.place_figure(placed)
     *maps, chart = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(maps) >= 2
-    assert all(("with all anchors present" in title) == bool(survive) for title in maps)
+    words = "after the loss of the anchor that hurts most"
+    assert all((words in title) == bool(survive) for title in maps)
     headline = place_answer.headline(placed.result)
     for text in (figure.get_suptitle(), chart, headline):
         assert ("with any one anchor missing" in text) == bool(survive)
-    assert ("with all anchors present" in place_svg.plan_part(placed)) == bool(survive)
+    assert (words in place_svg.plan_part(placed)) == bool(survive)
+
+
+def test_maps_and_table_of_the_worst_loss_at_each_place():
+    question = Question(range(4, 5), layout=ANCHORS, survive=1, trials=20)
+    placed = place_anchors(scene_files.of_mapping(HALL), question)
+    problem = placed.problem
+    (worst,) = shapes.maps_of(placed)
+    each = [accuracy.accuracy_map(problem, np.delete(ANCHORS, k, axis=0)) for k in range(4)]
+    for name in ("horizontal", "heading", "height"):
+        largest = np.max([getattr(one, name) for one in each], axis=0)
+        np.testing.assert_allclose(getattr(worst, name), largest, rtol=1e-6)
+    (zone,) = placed.result["zones"]
+    (judged,) = judge(problem, ANCHORS, 0, 1)
+    assert judged.without is not None
+    across = judged.without.horizontal / 0.5
+    turned = np.rad2deg(judged.without.heading) / 2.0
+    within = (np.maximum(across, turned) <= 1).all(axis=0).mean()
+    assert zone["any_loss"]["share"] == within
+    assert zone["any_loss"]["position_m"]["worst"] == judged.without.horizontal.max()
+    assert zone["any_loss"]["share"] <= zone["share"]
+    titles = [rows.title for rows in place_report.tables(placed.result)]
+    assert titles[1] == "after the loss of the anchor that hurts most at each place"

@@ -190,7 +190,7 @@ def test_the_report_is_the_same_for_the_same_result(placed, tmp_path, monkeypatc
 
 
 def test_maps_have_no_holes_where_a_wall_crosses(placed):
-    maps = shapes.maps_of(placed.problem, placed.design.anchors)
+    maps = shapes.maps_of(placed)
     for zone, one in zip(placed.problem.zones, maps, strict=True):
         layer = shapes.layer_of(zone, one, one.horizontal)
         assert np.isfinite(layer.values).all()
@@ -199,10 +199,10 @@ def test_maps_have_no_holes_where_a_wall_crosses(placed):
 
 def test_the_relative_map_is_the_largest_error_to_its_limit(placed):
     zone = placed.problem.zones[1]
-    one = shapes.maps_of(placed.problem, placed.design.anchors)[1]
+    one = shapes.maps_of(placed)[1]
     found = shapes.values_of(zone, one, "relative")
     np.testing.assert_allclose(found, one.heading / 0.01)
-    other = shapes.maps_of(placed.problem, placed.design.anchors)[2]
+    other = shapes.maps_of(placed)[2]
     assert np.isnan(shapes.values_of(placed.problem.zones[2], other, "relative")).all()
 
 

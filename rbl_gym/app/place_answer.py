@@ -50,8 +50,8 @@ def headline(result: dict[str, Any]) -> str:
 
 
 def case_of_maps(result: dict[str, Any]) -> str:
-    """Return which anchors the maps assume, if the verdict is for one anchor less; else ``""``."""
-    return "with all anchors present" if result["survive"] else ""
+    """Return which anchors the maps assume, if any one anchor may fail; else ``""``."""
+    return "after the loss of the anchor that hurts most at each place" if result["survive"] else ""
 
 
 def warnings(result: dict[str, Any]) -> list[str]:

@@ -27,7 +27,7 @@ styled = matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "axes.labe
 def place_figure(placed: Placed) -> Figure:
     """Draw one sheet: verdicts, maps of the required quantities, zones in words, a chart."""
     problem, anchors, result = placed.problem, placed.design.anchors, placed.result
-    maps = shapes.maps_of(problem, anchors)
+    maps = shapes.maps_of(placed)
     panels = map_panels(problem)
     tall = map_height(problem, anchors)
     heights = [tall] * ((len(panels) + 1) // 2)
@@ -94,7 +94,7 @@ def map_panel(
     problem, anchors = placed.problem, placed.design.anchors
     shown = shapes.layers(problem, maps, quantity.field)
     case = place_answer.case_of_maps(placed.result)
-    case, between = (f", {case}", "\n") if case else ("", ", ")
+    case, between = (f"\n{case}", ", ") if case else ("", ", ")
     if quantity.field == "relative":
         place_draw.draw_verdict(axes, shown)
         title = f"where the requirements are met{case}"

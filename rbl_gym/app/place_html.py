@@ -47,7 +47,7 @@ def place_scene(placed: Placed) -> go.Figure:
     problem, anchors = placed.problem, placed.design.anchors
     shown = go.Figure()
     quantity = shapes.quantities(problem)[0]
-    maps = shapes.maps_of(problem, anchors)
+    maps = shapes.maps_of(placed)
     layers = shapes.layers(problem, maps, quantity.field)
     low, high = shapes.colour_range(layers, None)
     for plane, layer in zip(maps, layers, strict=True):

@@ -50,11 +50,11 @@ def write_pdf(placed: Placed, path: str) -> None:
 
 def report_pages(placed: Placed) -> Iterator[Figure]:
     """Return the pages as figures."""
-    problem, anchors, result = placed.problem, placed.design.anchors, placed.result
+    result = placed.result
     yield _title_page(result)
     yield _plan_page(placed)
-    maps = shapes.maps_of(problem, anchors)
-    for quantity in place_figures.map_panels(problem):
+    maps = shapes.maps_of(placed)
+    for quantity in place_figures.map_panels(placed.problem):
         yield _map_page(placed, maps, quantity)
     rows = mounting_rows(placed)
     yield from _table_pages("Mounting list", [("", rows[0], rows[1:])])

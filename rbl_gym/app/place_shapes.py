@@ -16,6 +16,7 @@ from rbl_gym.geometry.polygons import contains, rectangle, to_segment
 from rbl_gym.geometry.regions import Shell
 from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.placing.accuracy import Map, accuracy_map
+from rbl_gym.studies.placing.answer import Placed
 from rbl_gym.studies.placing.judging import limits_of
 
 # Blue and vermilion of Okabe and Ito, distinguishable by everyone, and in grey.
@@ -198,9 +199,10 @@ class Layer(NamedTuple):
     free: Any
 
 
-def maps_of(problem: Problem, anchors: FloatArray, share: float = 0.5) -> list[Map]:
-    """Return the map of each zone at this fraction of its height."""
-    return [accuracy_map(problem, anchors, share=share, zone=zone) for zone in problem.zones]
+def maps_of(placed: Placed, share: float = 0.5) -> list[Map]:
+    """Return the map of each zone at this fraction of its height; of the worst loss if asked."""
+    problem, anchors, survive = placed.problem, placed.design.anchors, placed.result["survive"]
+    return [accuracy_map(problem, anchors, share, zone, survive) for zone in problem.zones]
 
 
 def layers(problem: Problem, maps: list[Map], field: str) -> list[Layer]:

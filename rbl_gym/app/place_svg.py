@@ -55,7 +55,7 @@ def plan_part(placed: Placed) -> str:
     levels = _LEVELS if len(problem.zones) <= _FEW else _LEVELS[1:2]
     levels = levels if any(z.high_m > z.low_m for z in problem.zones) else _LEVELS[1:2]
     middle = len(levels) // 2
-    maps = [shapes.maps_of(problem, anchors, share) for _, share in levels]
+    maps = [shapes.maps_of(placed, share) for _, share in levels]
     ranges = {
         q.field: shapes.colour_range(
             [layer for one in maps for layer in shapes.layers(problem, one, q.field)],
@@ -80,7 +80,7 @@ def plan_part(placed: Placed) -> str:
         "<g class='leaders' stroke='#333' vector-effect='non-scaling-stroke'></g></svg>"
     )
     case = place_answer.case_of_maps(placed.result)
-    case = f'<p class="note">The maps show the accuracy {case}.</p>' if case else ""
+    case = f'<p class="note">The maps show the errors {case}.</p>' if case else ""
     return (
         f'<figure class="plan">{_controls(panels, levels)}'
         f'<div class="stage" style="aspect-ratio: {size[0]:.1f} / {size[1]:.1f}">{svg}'

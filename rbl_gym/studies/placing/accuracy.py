@@ -133,7 +133,11 @@ class Map(NamedTuple):
 
 
 def accuracy_map(
-    problem: Problem, anchors: FloatArray, share: float = 0.5, zone: Zone | None = None
+    problem: Problem,
+    anchors: FloatArray,
+    share: float = 0.5,
+    zone: Zone | None = None,
+    survive: int = 0,
 ) -> Map:
     """Return the accuracy over x and y at one height of a zone.
 
@@ -145,6 +149,8 @@ def accuracy_map(
         The height: 0 is the lower side of the zone, 1 the upper one.
     zone
         The zone; None: the first one.
+    survive
+        1: each error at each position is that after the loss of the anchor that hurts it most.
     """
     zone = problem.zones[0] if zone is None else zone
     low, high = zone.bounds()
@@ -159,7 +165,10 @@ def accuracy_map(
     places = np.stack(np.meshgrid(*centres, at), axis=-1)[:, :, 0]
     free = is_free(problem, zone, places)
     found = np.full((len(Errors._fields), *free.shape), np.nan)
-    if free.any():
+    if free.any() and survive:
+        lost = accuracy_without_each(problem, anchors, places[free], zone)
+        found[:, free] = np.max(lost, axis=1)
+    elif free.any():
         found[:, free] = accuracy(problem, anchors, places[free], zone)
     errors = Errors(*found)
     return Map(

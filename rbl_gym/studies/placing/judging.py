@@ -22,6 +22,7 @@ from rbl_gym.studies.placing.requirements import (
     relative_errors,
     set_interval,
     share_within,
+    shortfall,
     value_at_share,
     wilson_interval,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "judge_zone",
     "limits_of",
     "overview",
+    "rank",
     "short_row",
     "verdict",
     "zone_row",
@@ -230,7 +232,9 @@ def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
 
     ``position_m`` (horizontal), ``height_m``, ``heading_deg`` and ``score_m`` have ``rms``,
     ``median``, ``p95`` and ``worst``. The worst value and ``worst_places``, which are apart from
-    each other, include the edges of the zone.
+    each other, include the edges of the zone. If any one anchor may fail, ``any_loss`` has the same
+    figures of the errors after the loss of the anchor that hurts most at each position, and with a
+    requirement the ``share`` of the positions that meet it after the loss of any one anchor.
 
     Parameters
     ----------
@@ -242,8 +246,22 @@ def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
         del row[f"rms_{name}"]
         worst = max(values.max(), told(edges.errors)[name].max(initial=0.0))
         row[name] = {**_spread(values), "worst": float(worst)}
+    if judged.without is not None:
+        row["any_loss"] = _any_loss(judged, judged.without)
     inner = Judged(judged.zone, judged.places, judged.judged)
     return row | {"worst_places": worst_places(_joined(inner, edges))}
+
+
+def _any_loss(judged: Judged, without: Errors) -> dict[str, Any]:
+    """Return errors after the loss, at each position, of the anchor that hurts most there."""
+    largest = Errors(*(values.max(axis=0) for values in without))
+    row: dict[str, Any] = {
+        name: {**_spread(values), "worst": float(values.max())}
+        for name, values in told(largest).items()
+    }
+    if judged.asks:
+        row["share"] = float(share_within(relative_errors(largest, limits_of(judged.zone))))
+    return row
 
 
 def overview(judged: list[Judged], edges: list[Judged]) -> dict[str, Any]:
@@ -378,6 +396,23 @@ def judge_beside(
     `judge_zone`; `judged` has the results of the other layout.
     """
     return [_judged(problem, one.zone, anchors, one.places, survive) for one in judged]
+
+
+def rank(judged: list[Judged]) -> tuple[bool, float, float]:
+    """Return what layouts are compared by, the smaller the better.
+
+    First whether any zone does not pass, then the weighted mean of the `shortfall` of the zones,
+    then b. The last two are over equally many positions of each zone.
+    """
+    asked = [one for one in judged if one.asks]
+    weights = [one.zone.weight for one in asked]
+    lacks = [float(shortfall(one.relative[:PLACES], one.zone.share)) for one in asked]
+    scores = [one.judged.score[:PLACES] for one in judged]
+    return (
+        verdict(judged) in ("fail", "undecided"),
+        float(np.average(lacks, weights=weights)) if asked else 0.0,
+        float(overall_score([one.zone for one in judged], scores)),
+    )
 
 
 def score_of(problem: Problem, anchors: FloatArray, seed: int) -> float:
