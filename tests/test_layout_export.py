@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,22 +40,75 @@ def problem():
     return scene_files.of_mapping(TABLES, name="hall")
 
 
-def test_the_list_says_how_high_which_way_and_how_far_from_corners(problem):
+def test_the_list_says_how_high_which_way_and_how_far_from_walls(problem):
     rows = mounting_list(problem, ANCHORS)
     assert [row["faces"] for row in rows] == ["+y", "-x", "-y", "down"]
     assert [row["name"] for row in rows] == ["1", "2", "3", "4"]
     # The slab's top is at 1.2 m.
     assert [row["above_floor_m"] for row in rows] == pytest.approx([1.3, 0.8, 1.8, 2.3])
     assert rows[0]["mount"].startswith("hall")
-    for row, anchor in zip(rows, ANCHORS, strict=True):
-        assert len(row["corners"]) == 2
-        for corner in row["corners"]:
-            away = np.hypot(corner["x_m"] - anchor[0], corner["y_m"] - anchor[1])
-            assert corner["distance_m"] == pytest.approx(away, abs=1e-3)
-            assert corner["x_m"] in (0, 8)
-            assert corner["y_m"] in (0, 6)
-    ends = [corner["distance_m"] for corner in rows[0]["corners"]]
-    assert sorted(ends) == [3, 5]
+    found = [
+        [(one["side"], one["to"], one["distance_m"]) for one in row["measured"]] for row in rows
+    ]
+    # Who faces the wall at y = 0 looks to -y, and has +x on the left.
+    assert found == [
+        [("left", "wall", 5.0), ("right", "wall", 3.0)],
+        [("left", "wall", 1.5), ("right", "wall", 4.5)],
+        [("left", "wall", 1.0), ("right", "wall", 7.0)],
+        [("-y", "wall", 2.0), ("-x", "wall", 2.0)],
+    ]
+
+
+ROOMS: dict[str, Any] = {
+    "anchors": {"number": 4},
+    "walls": [
+        {"line": [[0, 0], [10, 0], [10, 6], [0, 6]], "closed": True, "high_m": 3.0,
+         "thickness_m": 0.2},
+        # Two rooms with a door from y = 4 to 5; the second has a low wall, and a pillar.
+        {"line": [[4, 0], [4, 4]], "high_m": 3.0, "thickness_m": 0.2},
+        {"line": [[4, 5], [4, 6]], "high_m": 3.0, "thickness_m": 0.2},
+        {"line": [[7, 0], [7, 3]], "high_m": 1.2},
+    ],
+    "obstacles": [{"low": [8, 4, 0], "high": [8.5, 4.5, 3.0]}],
+    "mounts": [
+        {"kind": "ceiling", "polygon": [[0, 0], [10, 0], [10, 6], [0, 6]], "height_m": 2.9},
+        {"kind": "wall", "line": [[4, 0], [4, 4]], "side": "both", "low_m": 2.0, "high_m": 2.8},
+        {"kind": "wall", "line": [[0, 6], [10, 6]], "side": "right", "low_m": 2.0, "high_m": 2.8},
+    ],
+    "zones": [{"name": "a", "polygon": [[1, 1], [3, 1], [3, 5], [1, 5]], "low_m": 0.5,
+               "high_m": 1.5}],
+    "body": {"shape": "octahedron", "size_m": 0.8},
+    "noise": {"floor_m": 0.1},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("anchor", "found"),
+    [
+        # Under the ceiling of the second room: its own walls, not those of the first; over the low
+        # wall; but not behind the pillar.
+        ([5.0, 2.0, 2.9], [("-x", "wall", 0.9, 4.1, 2.0), ("-y", "wall", 1.9, 5.0, 0.1)]),
+        ([8.2, 5.0, 2.9], [("-y", "wall", 0.5, 8.2, 4.5), ("+x", "wall", 1.7, 9.9, 5.0)]),
+        # On the inner wall from the first room: the corner to the left, the door to the right.
+        ([3.9, 1.0, 2.5], [("left", "end of the wall", 3.0, 3.9, 4.0),
+                           ("right", "wall", 0.9, 3.9, 0.1)]),
+        # On the outer wall of the second room: up to the inner wall.
+        ([5.0, 5.9, 2.5], [("left", "wall", 0.9, 4.1, 5.9), ("right", "wall", 4.9, 9.9, 5.9)]),
+    ],
+)  # fmt: skip
+def test_distances_are_to_walls_that_are_seen_from_the_anchor(anchor, found):
+    rooms = scene_files.of_mapping(ROOMS)
+    (row,) = mounting_list(rooms, np.array([anchor]))
+    keys = ("side", "to", "distance_m", "x_m", "y_m")
+    assert [tuple(one[key] for key in keys) for one in row["measured"]] == found
+
+
+def test_a_ceiling_without_walls_is_measured_from_its_edges():
+    tables: dict[str, Any] = {key: value for key, value in ROOMS.items() if key not in ("walls", "obstacles")}
+    tables["mounts"] = ROOMS["mounts"][:1]
+    (row,) = mounting_list(scene_files.of_mapping(tables), np.array([[5.0, 2.0, 2.9]]))
+    found = [(one["side"], one["to"], one["distance_m"]) for one in row["measured"]]
+    assert found == [("-y", "edge of the mount", 2.0), ("-x", "edge of the mount", 5.0)]
 
 
 def test_csv_is_a_layout_that_place_reads(problem, tmp_path):

@@ -68,14 +68,21 @@ def mounting_rows(placed: Placed) -> list[list[str]]:
     """Return the mounting list as texts, headings first."""
     headings = ["anchor", "x [m]", "y [m]", "z [m]", "above floor [m]", "mount", "faces"]
     found = mounting_list(placed.problem, placed.design.anchors, place_figures.anchor_names(placed))
-    with_corners = any(row["corners"] for row in found)
-    rows = [headings + (["from the corner at", "and from"] if with_corners else [])]
+    rows = [[*headings, "measured from", "and from"]]
     for row in found:
-        ends = [f"({c['x_m']:g}, {c['y_m']:g}): {c['distance_m']:.2f} m" for c in row["corners"]]
+        ends = [measured_text(one) for one in row["measured"]]
         cells = [row["name"], *(f"{row[key]:.3f}" for key in ("x_m", "y_m", "z_m"))]
         cells += [f"{row['above_floor_m']:.2f}", row["mount"], row["faces"]]
-        rows.append(cells + ([*ends, "", ""][:2] if with_corners else []))
+        rows.append([*cells, *[*ends, "-", "-"][:2]])
     return rows
+
+
+def measured_text(one: dict[str, Any]) -> str:
+    """Return a distance to a wall in words."""
+    where = f"{one['to']} at ({one['x_m']:g}, {one['y_m']:g})"
+    if one["side"] in ("left", "right"):
+        return f"{one['distance_m']:.2f} m to the {one['side']}: {where}"
+    return f"{one['distance_m']:.2f} m towards {one['side']}: {where}"
 
 
 def _page(title: str) -> Figure:

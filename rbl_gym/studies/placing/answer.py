@@ -11,7 +11,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.geometry.obstacles import box_bounds
-from rbl_gym.placement import criteria, scene_files
+from rbl_gym.placement import criteria, layouts, scene_files
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing import check, choosing, design
 from rbl_gym.studies.placing.accuracy import accuracy_without_each
@@ -186,8 +186,12 @@ def _designed(
     starts = [found.anchors]
     if question.optimise and start is not None and len(start) == problem.n_anchors:
         starts.append(start)
-    tried = [choosing.improved(problem, one, seed, survive) for one in starts]
-    better, _ = min(tried, key=lambda pair: pair[1])
+    starts += [
+        anchors
+        for name, anchors in found.searched.items()
+        if name in layouts.LAYOUTS and not problem.obstacles.contain(anchors).any()
+    ]
+    better = choosing.meeting(problem, starts, seed, survive)
     why = "loss of one" if survive else "requirements"
     return found._replace(anchors=better, method=f"{found.method}, exchanges for {why}")
 

@@ -11,7 +11,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.sample import prior_of
 from rbl_gym.studies.placing.accuracy import spread_places
-from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
+from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of, rank
 from rbl_gym.studies.placing.links import anchor_information
 from rbl_gym.studies.placing.requirements import Limits, turns, value_at_share
 from rbl_gym.studies.placing.stock_search import (
@@ -26,7 +26,7 @@ from rbl_gym.studies.placing.stock_search import (
 )
 from rbl_gym.studies.progress import Advance, silent
 
-__all__ = ["Fewest", "fewest_anchors", "next_anchor"]
+__all__ = ["Fewest", "fewest_anchors", "meeting", "next_anchor"]
 
 # Poses of a search: positions in all zones together, minimum in each zone, and rotations.
 _PLACES, _LEAST_PLACES, _TURNS = 400, 128, 3
@@ -165,6 +165,29 @@ def first_then_others(anchors: FloatArray, points: FloatArray) -> FloatArray:
     return np.concatenate([anchors, points[~known]])
 
 
+def meeting(
+    problem: Problem, starts: list[FloatArray], seed: int, survive: int = 0
+) -> FloatArray:
+    """Return a layout (M, 3) by exchanges from the best of the starts, by its `rank`.
+
+    If it does not pass, it is improved once more over more positions. It is never worse than the
+    starts. Arguments as in `improved`.
+    """
+
+    def ranked(anchors: FloatArray, most: int | None = None) -> tuple[bool, float, float]:
+        return rank(judge(problem, anchors, seed, survive, most))
+
+    best = min(starts, key=lambda one: ranked(one, PLACES))
+    least = ranked(best)
+    for fine in (False, True):
+        if fine and not least[0]:
+            break
+        found, _ = improved(problem, best, seed + 1000 * fine, survive, fine)
+        if (reached := ranked(found)) < least:
+            best, least = found, reached
+    return best
+
+
 # --- the smallest number -------------------------------------------------------------------------
 
 
@@ -259,18 +282,16 @@ def _searched(
 ) -> _Found:
     """Search from the first starts, then refine the best layout, until the requirements are met.
 
-    Layouts are compared by the errors at the required shares, at the same positions.
+    Layouts are compared by their `rank`.
     """
-    found: list[tuple[float, FloatArray, list[Judged]]] = []
+    found: list[tuple[FloatArray, list[Judged]]] = []
 
     def search(start: FloatArray, fine: bool) -> bool:
         advance(0, more=1)
         # Other seeds than those near that of the user.
         anchors, _ = improved(problem, start, seed + 1000 * len(found), survive, fine)
         judged = judge(problem, anchors, seed, survive)
-        asked = [one for one in judged if one.asks]
-        reached = [value_at_share(one.relative[:PLACES], one.zone.share) for one in asked]
-        found.append((float(max(reached)), anchors, judged))
+        found.append((anchors, judged))
         advance()
         return is_met(judged)
 
@@ -278,13 +299,19 @@ def _searched(
     for k in range(_FINE):
         if met:
             break
-        found.sort(key=lambda row: row[0])
-        if found[0][0] > _HOPELESS[k > 1]:
+        found.sort(key=lambda row: rank(row[1]))
+        if min(_reached(judged) for _, judged in found) > _HOPELESS[k > 1]:
             break
         # First the two best layouts, then the best one.
-        met = search(found[min(k, len(found) - 1) if k < 2 else 0][1], True)
-    _, anchors, judged = found[-1] if met else min(found, key=lambda row: row[0])
+        met = search(found[min(k, len(found) - 1) if k < 2 else 0][0], True)
+    anchors, judged = found[-1] if met else min(found, key=lambda row: rank(row[1]))
     return _Found(anchors, judged, met, len(found))
+
+
+def _reached(judged: list[Judged]) -> float:
+    """Return the relative error at the required share, of the zone where it is largest."""
+    asked = [one for one in judged if one.asks]
+    return max(float(value_at_share(one.relative[:PLACES], one.zone.share)) for one in asked)
 
 
 def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[int]]:
@@ -293,7 +320,7 @@ def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[
     for chosen, reached in grown(stock, range(keep), most, survive):
         path[len(chosen)] = chosen
         # The greedy choice has passed the first number to try.
-        if stock.asks and reached <= 0.8:
+        if stock.asks and reached < 0:
             break
     return path
 
@@ -304,7 +331,7 @@ def _first_count(
     """Return the number at which the greedy choice meets the requirements, or the largest one."""
     path = starts[0]
     for count in sorted(path):
-        if count >= max(numbers[0], 1) and value(stock, path[count], survive) <= 1:
+        if count >= max(numbers[0], 1) and value(stock, path[count], survive) < 0:
             return count
     return max(min(numbers[-1], max(path)), numbers[0])
 

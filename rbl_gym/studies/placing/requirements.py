@@ -27,11 +27,16 @@ __all__ = [
     "errors_of",
     "relative_errors",
     "set_interval",
+    "shortfall",
     "turns",
     "value_at_share",
     "wilson_interval",
 ]
 
+# Shortfall of a zone: for the margin that it lacks, and for the whole of its required share.
+_MARGIN, _ALL = 0.3, 0.7
+# Weight of the mean log of the errors above their limits, which gives a slope far from the limits.
+_EXCESS = 0.1
 # Random rotations of a free body are always the same.
 _TURN_SEED = 20130821
 
@@ -201,6 +206,28 @@ def value_at_share(values: FloatArray, share: float) -> FloatArray:
     check_number("share", share, low=0.0, high=1.0)
     rank = _rank(share, values.shape[-1])
     return np.partition(values, rank, axis=-1)[..., rank]
+
+
+def shortfall(relative: FloatArray, share: float) -> FloatArray:
+    """Return what a zone lacks of its requirement (...), zero if and only if it is met.
+
+    Of the best positions that fill the required share, it is the part whose errors are above their
+    limits, plus what its margin lacks of 1, plus a tenth of the mean log of the errors over the
+    limits.
+
+    Parameters
+    ----------
+    relative
+        Relative errors at positions (..., L).
+    share
+        Required share of the positions, above 0, at most 1.
+    """
+    rank = _rank(share, relative.shape[-1])
+    best = np.partition(relative, rank, axis=-1)[..., : rank + 1]
+    above = (best > 1).mean(axis=-1)
+    excess = np.log(np.maximum(best, 1.0)).mean(axis=-1)
+    margin = 1 / np.maximum(best.max(axis=-1), 1.0)
+    return _MARGIN * (1 - margin) + _ALL * above + _EXCESS * excess
 
 
 def _rank(share: float, count: int) -> int:

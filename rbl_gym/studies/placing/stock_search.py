@@ -2,8 +2,9 @@
 
 Information is a sum over the anchors. The information of each candidate is therefore computed once,
 and a layout is a choice of candidates, ``list[int]``; the fixed ones come first. The objective is
-the distance of the zones from their requirements, or b without requirements. For layouts that must
-survive the loss of any one anchor, it is the worst remaining case.
+first to meet the requirements of the zones, or to miss as little of them as possible; among layouts
+that meet them, it is b. For layouts that must survive the loss of any one anchor, it is the worst
+remaining case.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from rbl_gym.studies.placing.requirements import (
     asked_of,
     errors_of,
     relative_errors,
-    value_at_share,
+    shortfall,
 )
 
 __all__ = ["Stock", "ZonePoses", "all_choices", "cheaper", "grown", "swapped", "value"]
 
-# An exchange must reduce the value by at least this share.
+# An exchange must reduce the value by at least this much.
 _GAIN = 1e-3
+# The search leaves this factor between errors and limits: it sees fewer positions than the verdict.
+_SPARE = 1.03
+# Offset of the value if the requirements are met: log b is always smaller.
+_MET = 100.0
 # Maximum number of passes over all anchors.
 _SWEEPS = 20
-# Weight of the mean relative error beside the relative error at the required share. It decides
-# between layouts that are equal at that share, and gives a slope far from the requirement.
-_OF_MEAN = 1e-2
 # For a long list: step between the positions at which all candidates are compared, number of
 # candidates that are then tried exactly, and number of worst losses that are compared.
 _EVERY, _TRIED, _WORST_LOSSES = 4, 24, 3
@@ -93,10 +95,12 @@ Base = Sequence[FloatArray]  # information (L, T, 6, 6) of each zone
 
 
 def value(stock: Stock, chosen: Sequence[int], survive: int = 0) -> float:
-    """Return the objective of the search; requirements are met if it is at most 1.
+    """Return the objective of the search; requirements are met if it is negative.
 
-    It is the relative error at the required share, of the zone where it is largest, plus a
-    hundredth of the mean relative error. Without requirements, it is b.
+    If they are missed, it is the mean of the `shortfall` of the zones, with their weights. If they
+    are met, or there are none, it is log b - 100: any such layout is better than one that misses a
+    requirement. Errors count as 3 % larger than they are, so that layouts that are just within on
+    these positions are not preferred.
 
     Parameters
     ----------
@@ -155,7 +159,7 @@ def swapped(
         before = best
         for k in range(keep, len(found)):
             others = found[:k] + found[k + 1 :]
-            limit = best * (1 - _GAIN)
+            limit = best - _GAIN
             new, reached = _best_added(stock, coarse, others, survive, limit)
             if reached < limit and new != found[k]:
                 found[k], best = new, reached
@@ -183,7 +187,7 @@ def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
     Arguments as in `swapped`.
     """
     found = list(chosen)
-    if value(stock, found, survive) > 1:
+    if value(stock, found, survive) >= 0:
         return found
     saved = True
     while saved:
@@ -192,8 +196,8 @@ def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
             others = found[:k] + found[k + 1 :]
             less = stock.cost < stock.cost[found[k]] - 1e-12
             which = np.setdiff1d(np.flatnonzero(less), found)
-            scores = with_candidates(stock, others, which, survive, 1 + 1e-12)
-            good = np.flatnonzero(scores <= 1)
+            scores = with_candidates(stock, others, which, survive, 0.0)
+            good = np.flatnonzero(scores < 0)
             if len(good):
                 order = np.lexsort((scores[good], stock.cost[which[good]]))
                 found[k], saved = int(which[good[order[0]]]), True
@@ -304,21 +308,36 @@ def with_candidates(
 def _values(stock: Stock, base: Base, added: np.ndarray | slice | None = None) -> FloatArray:
     """Return the value (J,) of information (..., L, T, 6, 6) plus each of the added candidates."""
     more = [None if added is None else part[added] for part in stock.parts]
-    of_zones = list(zip(stock.zones, base, more, strict=True))
-    if not stock.asks:
-        weights = np.array([zone.weight for zone in stock.zones])
-        scores = [
-            errors_of(total, zone.rotation, zone.tags, part).score for zone, total, part in of_zones
-        ]
-        squares = [(score**2).mean(axis=-1) for score in scores]
-        return np.atleast_1d(np.sqrt(np.tensordot(weights / weights.sum(), squares, axes=1)))
-    worst, mean = [], []
-    for zone, total, part in of_zones:
-        if zone.limits.any():
-            relative = relative_errors(asked_of(total, part), zone.limits)
-            worst.append(value_at_share(relative, zone.share))
-            mean.append(relative.mean(axis=-1))
-    q, slope = np.max(worst, axis=0), _OF_MEAN * np.mean(mean, axis=0)
-    # If the requirements are met, the value must not exceed 1.
-    met = (1 - _OF_MEAN) * q + np.minimum(slope, _OF_MEAN)
-    return np.atleast_1d(np.where(q <= 1, met, q + slope))
+    missing = np.atleast_1d(_missing(stock, base, more))
+    met = np.flatnonzero(missing == 0)
+    if len(met):
+        missing[met] = np.log(_scores(stock, base, more, met)) - _MET
+    return missing
+
+
+def _missing(stock: Stock, base: Base, more: list[FloatArray | None]) -> FloatArray:
+    """Return the weighted mean (J,) of the shortfalls of the zones."""
+    weights = [zone.weight for zone in stock.zones if zone.limits.any()]
+    found = [
+        shortfall(_SPARE * relative_errors(asked_of(total, part), zone.limits), zone.share)
+        for zone, total, part in zip(stock.zones, base, more, strict=True)
+        if zone.limits.any()
+    ]
+    if found:
+        return np.tensordot(np.array(weights) / sum(weights), found, axes=1)
+    part, total = more[0], base[0]
+    return np.zeros(len(part) if part is not None else total.shape[:-4])
+
+
+def _scores(
+    stock: Stock, base: Base, more: list[FloatArray | None], which: np.ndarray
+) -> FloatArray:
+    """Return b (K,) over all zones, for the layouts `which` (K) of `_values`."""
+    weights = np.array([zone.weight for zone in stock.zones])
+    squares = []
+    for zone, total, part in zip(stock.zones, base, more, strict=True):
+        some = None if part is None else part[which]
+        total = total[which] if total.ndim == 5 else total
+        squares.append(errors_of(total, zone.rotation, zone.tags, some).score ** 2)
+    means = [np.atleast_1d(square.mean(axis=-1)) for square in squares]
+    return np.sqrt(np.tensordot(weights / weights.sum(), means, axes=1))

@@ -1,0 +1,201 @@
+"""Measure where an anchor is from the walls that can be seen from it, as with a tape.
+
+Everything is in the plan. Edges are the sides of obstacles that reach up to the anchor, and the
+lines of walls for mounts. If fewer than two of them are seen, the outline of the mounts serves, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.mounts import Mounts
+from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.placement.building import Problem
+
+__all__ = ["direction", "floor_below", "measured_from"]
+
+# An obstacle is a floor slab if it is at most this thick and at least this large. Floors above z =
+# 0 begin on one.
+_SLAB_M, _SLAB_M2 = 0.6, 20.0
+# Obstacles that end this far below the anchor, or below this height above the floor, are racks and
+# furniture, over which a tape passes.
+_BELOW_M, _FURNITURE_M = 0.5, 1.8
+# A tape runs this far in front of a wall; edges closer than this are the wall itself, metres.
+_FREE_M, _SAME_M = 0.005, 0.02
+# Two tapes fix a position only if the sine of the angle between them is not smaller.
+_ACROSS = 0.5
+
+
+def floor_below(problem: Problem, point: FloatArray) -> float:
+    """Return the height of the floor below a point (3,): the top of the highest slab, or 0."""
+    prisms = problem.obstacles.prisms
+    tops = [0.0]
+    for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
+        slab = high - low <= _SLAB_M and abs(area(ring)) >= _SLAB_M2
+        if slab and high <= point[2] and contains(ring, point[None, :2], -1e-3)[0]:
+            tops.append(float(high))
+    return max(tops) if point[2] >= 0 else 0.0
+
+
+def direction(normal: FloatArray) -> str:
+    """Return the direction an anchor faces, in words."""
+    if not normal.any():
+        return "any"
+    if abs(normal[2]) > 0.99:
+        return "down" if normal[2] < 0 else "up"
+    angle = math.degrees(math.atan2(normal[1], normal[0])) % 360
+    nearest = round(angle / 90)
+    if abs(angle - 90 * nearest) < 0.5:
+        return ("+x", "+y", "-x", "-y")[nearest % 4]
+    return f"{angle:.0f} deg"
+
+
+def measured_from(
+    problem: Problem, anchor: FloatArray, normal: FloatArray
+) -> list[dict[str, Any]]:
+    """Return up to two distances in the plan that fix where an anchor (3,) is.
+
+    Each has ``side``, ``to``, ``x_m``, ``y_m`` and ``distance_m``. The point (x, y) can be seen
+    from the anchor. For an anchor on a wall, the sides are ``left`` and ``right`` as one faces the
+    wall, and `to` is ``wall``, the next wall in the corner, or ``end of the wall``. For others the
+    distances are at right angles to two walls, or to an ``edge of the mount`` where no wall is
+    seen, and the side is the direction of the wall.
+
+    Parameters
+    ----------
+    problem, anchor
+        The problem, and the position of the anchor, metres.
+    normal
+        Direction (3,) in which the anchor faces; zero for all directions.
+    """
+    place, edges = anchor[:2], _edges(problem, anchor)
+    if abs(normal[2]) < 0.5 and normal.any():
+        found = _along_wall(place, normal[:2] / np.linalg.norm(normal[:2]), edges)
+    else:
+        found = _at_right_angles(place, edges, len(edges))
+        if len(found) < 2:
+            every = np.concatenate([edges, _outline(problem)])
+            found = _at_right_angles(place, every, len(edges))
+    rows = []
+    for side, to, point in found:
+        x, y = (round(float(value), 3) + 0.0 for value in point)
+        away = round(float(np.linalg.norm(point - place)), 3)
+        rows.append({"side": side, "to": to, "x_m": x, "y_m": y, "distance_m": away})
+    return rows
+
+
+def _along_wall(
+    place: FloatArray, normal: FloatArray, edges: FloatArray
+) -> list[tuple[str, str, FloatArray]]:
+    """Return the ends of the wall of a position, to the left and to the right of it."""
+    left = np.array([normal[1], -normal[0]])
+    found = []
+    for side, along in (("left", left), ("right", -left)):
+        end = _end(place, along, edges)
+        hit = _first_hit(place + _FREE_M * normal, along, edges)
+        if hit <= end + _SAME_M:
+            found.append((side, "wall", place + hit * along))
+        elif end > 0:
+            found.append((side, "end of the wall", place + end * along))
+    return found
+
+
+def _end(place: FloatArray, along: FloatArray, edges: FloatArray) -> float:
+    """Return the distance to the end of the edges on the line through a position."""
+    off = edges - place
+    on_line = (np.abs(off @ np.array([-along[1], along[0]])) < 1e-3).all(axis=1)
+    reaches = np.sort(off[on_line] @ along, axis=1)
+    end = 0.0
+    while True:
+        joined = reaches[(reaches[:, 0] <= end + _SAME_M) & (reaches[:, 1] > end + 1e-9)]
+        if not len(joined):
+            return end
+        end = float(joined[:, 1].max())
+
+
+def _first_hit(start: FloatArray, along: FloatArray, edges: FloatArray) -> float:
+    """Return the distance along a ray to the first edge; infinite if there is none."""
+    side = edges[:, 1] - edges[:, 0]
+    off = edges[:, 0] - start
+    turn = along[0] * side[:, 1] - along[1] * side[:, 0]
+    crosses = np.abs(turn) > 1e-9
+    safe = np.where(crosses, turn, 1.0)
+    reach = (off[:, 0] * side[:, 1] - off[:, 1] * side[:, 0]) / safe
+    share = (off[:, 0] * along[1] - off[:, 1] * along[0]) / safe
+    hit = crosses & (reach > 1e-9) & (share >= -1e-9) & (share <= 1 + 1e-9)
+    return float(reach[hit].min(initial=np.inf))
+
+
+def _at_right_angles(
+    place: FloatArray, edges: FloatArray, walls: int
+) -> list[tuple[str, str, FloatArray]]:
+    """Return the nearest visible wall, and the nearest one across it, at right angles to each.
+
+    The first `walls` edges are walls, the others edges of mounts.
+    """
+    side = edges[:, 1] - edges[:, 0]
+    length = np.linalg.norm(side, axis=1)
+    side = side / np.maximum(length, 1e-9)[:, None]
+    share = ((place - edges[:, 0]) * side).sum(axis=1)
+    feet = edges[:, 0] + share[:, None] * side
+    distance = np.linalg.norm(feet - place, axis=1)
+    on_edge = (length > 1e-6) & (share >= -1e-9) & (share <= length + 1e-9)
+    found: list[tuple[str, str, FloatArray]] = []
+    first: FloatArray | None = None
+    for k in np.argsort(distance, kind="stable").tolist():
+        if not on_edge[k] or distance[k] < _SAME_M:
+            continue
+        along = (feet[k] - place) / distance[k]
+        if first is not None and abs(along[0] * first[1] - along[1] * first[0]) < _ACROSS:
+            continue
+        if _first_hit(place, along, edges) < distance[k] - 1e-6:
+            continue
+        to = "wall" if k < walls else "edge of the mount"
+        found.append((direction(np.array([*along, 0.0])), to, feet[k]))
+        if first is not None:
+            break
+        first = along
+    return found
+
+
+def _edges(problem: Problem, anchor: FloatArray) -> FloatArray:
+    """Return edges (K, 2, 2) of the obstacles that reach an anchor, and of mounts on walls."""
+    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
+    z = float(anchor[2])
+    head = min(z - 1e-6, max(z - _BELOW_M, floor_below(problem, anchor) + _FURNITURE_M))
+    rings = [
+        box[:2] + turns * box[3:5]
+        for box in boxes
+        if box[2] - box[5] < z and box[2] + box[5] > head
+    ]
+    for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
+        if low < z and high > head:
+            rings.append(ring)
+    found = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]
+    faces = problem.mounts.faces
+    upright = (np.abs(faces.axes[..., 2]) > 0.5) & (faces.extents > 0)
+    for k in np.flatnonzero(upright.any(axis=1)).tolist():
+        flat = [i for i in range(3) if faces.extents[k, i] > 0 and not upright[k, i]]
+        if len(flat) == 1:
+            end = faces.origin[k] + faces.extents[k, flat[0]] * faces.axes[k, flat[0]]
+            found.append(np.array([[faces.origin[k][:2], end[:2]]]))
+    return np.concatenate([*found, np.empty((0, 2, 2))])
+
+
+def _outline(problem: Problem) -> FloatArray:
+    """Return the outline (K, 2, 2) of mounts that are areas in the plan."""
+    if not isinstance(problem.mounts, Mounts):
+        return np.empty((0, 2, 2))
+    corners = np.round(problem.mounts.pieces[:, :6].reshape(-1, 3, 2), 6)
+    corners = corners[(corners[:, 1] != corners[:, 2]).any(axis=1)]
+    sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
+    # A side of two triangles is inside.
+    keys = [tuple(sorted(map(tuple, side.tolist()))) for side in sides]
+    count = Counter(keys)
+    return sides[[count[key] == 1 for key in keys]]
