@@ -104,7 +104,9 @@ def test_distances_are_to_walls_that_are_seen_from_the_anchor(anchor, found):
 
 
 def test_a_ceiling_without_walls_is_measured_from_its_edges():
-    tables: dict[str, Any] = {key: value for key, value in ROOMS.items() if key not in ("walls", "obstacles")}
+    tables: dict[str, Any] = {
+        key: value for key, value in ROOMS.items() if key not in ("walls", "obstacles")
+    }
     tables["mounts"] = ROOMS["mounts"][:1]
     (row,) = mounting_list(scene_files.of_mapping(tables), np.array([[5.0, 2.0, 2.9]]))
     found = [(one["side"], one["to"], one["distance_m"]) for one in row["measured"]]

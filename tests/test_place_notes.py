@@ -82,7 +82,7 @@ def test_a_usual_layout_that_passes_more_zones_or_has_a_much_smaller_b_is_named(
     layouts = {"designed": layout(1.2, "fail", "fail"), "grid": layout(1.0, "pass", "fail")}
     (note,) = usual_notes({"layouts": layouts})
     assert note.startswith(
-        "The usual layout 'grid' passes more zones: 1 of 2 (the designed layout: 0). To"
+        "The usual layout 'grid' passes more zones: 1 of 2 (the designed layout: 0). The"
     )
     layouts = {"designed": layout(1.2, "pass", "pass"), "ring": layout(0.12, "pass", "fail")}
     (note,) = usual_notes({"layouts": layouts})

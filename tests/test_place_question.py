@@ -258,18 +258,43 @@ def test_one_more_anchor_goes_where_it_helps_most():
     assert found is not None
     place = found
     scores = {
-        k: max(
-            judging.short_row(one)["margin"] ** -1
-            for one in judging.judge(problem, mounts(*chosen, k), 0, most=judging.PLACES)
-        )
+        k: judging.rank(judging.judge(problem, mounts(*chosen, k), 0, most=judging.PLACES))
         for k in range(10)
         if k not in chosen
     }
     reached = scores[int(np.abs(np.array(BRACKETS) - place).sum(axis=1).argmin())]
-    # The choice is made over fewer places than it is judged by.
-    assert reached < 1.05 * min(scores.values())
-    assert reached < np.median(list(scores.values()))
+    # With it all zones pass, so b counts. The choice is made over fewer places.
+    assert reached[:2] == (False, 0.0)
+    assert reached[2] < 1.05 * min(one[2] for one in scores.values())
+    assert reached[2] < np.median([one[2] for one in scores.values()])
     assert choosing.next_anchor(problem, mounts(*range(10)), 0) is None
+
+
+def test_exchanges_meet_requirements_first_and_then_make_b_small():
+    problem = room(position_m=0.09, heading_deg=8.0)
+    starts = [mounts(0, 1, 2, 3, 4, 6, 7), mounts(3, 4, 5, 6, 7, 8, 9)]
+
+    def rank(anchors):
+        return judging.rank(judging.judge(problem, anchors, 0))
+
+    found = choosing.meeting(problem, starts, 0)
+    np.testing.assert_array_equal(found, choosing.meeting(problem, starts, 0))
+    assert rank(found) <= min(map(rank, starts))
+    of_all = [rank(mounts(*chosen)) for chosen in itertools.combinations(range(10), 7)]
+    assert not rank(found)[0]
+    # Of those that pass, its b is among the smallest tenth.
+    passing = sorted(b for fails, _, b in of_all if not fails)
+    assert rank(found)[2] <= passing[len(passing) // 10]
+
+
+def test_with_too_few_anchors_a_zone_that_can_be_met_is_met():
+    # The bay's limit is out of reach of any choice; the hall's is not.
+    tables = copy.deepcopy(ROOM)
+    tables["zones"][1]["position_m"] = 0.001
+    problem = scene_files.of_mapping(tables)
+    found = choosing.meeting(problem, [mounts(*range(8))], 0)
+    hall, bay = judging.judge(problem, found, 0)
+    assert (hall.verdict, bay.verdict) == ("pass", "fail")
 
 
 # --- the least number ----------------------------------------------------------------------------

@@ -194,9 +194,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     named = _references(options, task, [])
     _require_searches({*named})
     if skipped := evaluation.skipped_references(task, named):
-        print(
-            f"skipped: {', '.join(skipped)}: pip install 'rbl-gym[placement]'", file=sys.stderr
-        )
+        print(f"skipped: {', '.join(skipped)}: pip install 'rbl-gym[placement]'", file=sys.stderr)
     names = named or None
     with progress(title) as advance:
         result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)

@@ -165,9 +165,7 @@ def first_then_others(anchors: FloatArray, points: FloatArray) -> FloatArray:
     return np.concatenate([anchors, points[~known]])
 
 
-def meeting(
-    problem: Problem, starts: list[FloatArray], seed: int, survive: int = 0
-) -> FloatArray:
+def meeting(problem: Problem, starts: list[FloatArray], seed: int, survive: int = 0) -> FloatArray:
     """Return a layout (M, 3) by exchanges from the best of the starts, by its `rank`.
 
     If it does not pass, it is improved once more over more positions. It is never worse than the

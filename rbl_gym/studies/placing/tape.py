@@ -55,9 +55,7 @@ def direction(normal: FloatArray) -> str:
     return f"{angle:.0f} deg"
 
 
-def measured_from(
-    problem: Problem, anchor: FloatArray, normal: FloatArray
-) -> list[dict[str, Any]]:
+def measured_from(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[dict[str, Any]]:
     """Return up to two distances in the plan that fix where an anchor (3,) is.
 
     Each has ``side``, ``to``, ``x_m``, ``y_m`` and ``distance_m``. The point (x, y) can be seen
