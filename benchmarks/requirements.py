@@ -36,10 +36,11 @@ def rooms() -> Tables:
         *([[x, y], [x + 4.5, y]] for x in (0, 6, 12) for y in (5, 7)),
         *([[x, low], [x, high]] for x in (6, 12) for low, high in ((0, 5), (7, 12))),
     ]
+    inner = (0.5, 0.5), (5.5, 0.5), (5.5, 4.5), (0.5, 4.5)
     zones = [
         {
             "name": f"room {k + 1}",
-            "polygon": [[x + 0.5, y + 0.5], [x + 5.5, y + 0.5], [x + 5.5, y + 4.5], [x + 0.5, y + 4.5]],
+            "polygon": [[x + a, y + b] for a, b in inner],
             "low_m": 0.5,
             "high_m": 1.5,
             "attitude": "level",

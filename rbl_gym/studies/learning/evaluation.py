@@ -31,7 +31,6 @@ __all__ = ["Layouts", "evaluate", "held_out_returns", "layouts_of", "references"
 
 # The reference with one layout for all contexts, and the number of contexts for its search.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
-# References that need the package cmaes.
 _OF_CMAES = (_ONE_LAYOUT, "cma-es")
 # Row of the best layouts of the strongest searches.
 BEST_KNOWN = "best-known"
@@ -56,9 +55,8 @@ def references(task: RlTask) -> list[str]:
 
 def skipped_references(task: RlTask, named: Sequence[str]) -> list[str]:
     """Return the references that are left out: not named, and without the package they need."""
-    if find_spec("cmaes") is not None:
-        return []
-    return [name for name in references(task) if name in _OF_CMAES and name not in named]
+    lacking = () if find_spec("cmaes") else _OF_CMAES
+    return [name for name in references(task) if name in lacking and name not in named]
 
 
 def strongest(task: RlTask) -> list[str]:
@@ -97,16 +95,15 @@ def evaluate(
     Parameters
     ----------
     task
-        A task, its name (`rl_tasks.TASKS`), or an environment of `gym.make` or `gym.make_vec` with
-        one of the ids of these tasks. Its arguments are used; it is not changed.
+        A task, its name (`rl_tasks.TASKS`), or an environment of one of these tasks. Its arguments
+        are used; it is not changed.
     policies
         One policy or a dict by label: anything that `own_policies.policy_like` takes, for example a
         function ``observation -> actions``, where both are arrays of all worlds. A placement task
         also refines each by a few gradient steps, as ``LABEL + gradient``.
     names
-        Names of `references`; None: all. ``random`` and the strongest are always included. If there
-        are several strongest, ``best-known`` is the best of them in each world. Without the package
-        cmaes, references that need it and are not named are left out.
+        Names of `references`; None: all. ``random`` and the strongest are always included, except
+        without the package they need. ``best-known`` is the best of several in each world.
     worlds, seed
         Number and seed of the worlds.
     advance
@@ -140,9 +137,8 @@ def evaluate(
     names = [name for name in known if name in {*names, known[0], *best_of}]
     play = _placement_losses if task.env_id == "RBL/AnchorPlacement-v0" else _loop_losses
     losses = play(task, policies, names, worlds, seed, advance)
-    best = best_of[0]
-    if len(best_of) > 1:
-        best = BEST_KNOWN
+    best = best_of[0] if len(best_of) == 1 else BEST_KNOWN
+    if best == BEST_KNOWN:
         losses[best] = np.min([losses[name] for name in best_of], axis=0)
     rng = np.random.default_rng([seed, len(references(task)) + 1])
     resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 # Shortfall of a zone: for the margin that it lacks, and for the whole of its required share.
-_MARGIN, _ALL = 0.5, 0.5
+_MARGIN, _ALL = 0.3, 0.7
 # Weight of the mean log of the errors above their limits, which gives a slope far from the limits.
 _EXCESS = 0.1
 # Random rotations of a free body are always the same.
@@ -211,9 +211,9 @@ def value_at_share(values: FloatArray, share: float) -> FloatArray:
 def shortfall(relative: FloatArray, share: float) -> FloatArray:
     """Return what a zone lacks of its requirement (...), zero if and only if it is met.
 
-    Of the best positions that fill the required share, it is half the part whose errors are above
-    their limits, plus half of what the margin lacks of 1, plus a tenth of the mean log of the
-    errors over the limits.
+    Of the best positions that fill the required share, it is 0.7 times the part whose errors are
+    above their limits, plus 0.3 times what the margin lacks of 1, plus a tenth of the mean log of
+    the errors over the limits.
 
     Parameters
     ----------

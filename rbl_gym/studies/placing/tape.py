@@ -1,7 +1,7 @@
 """Measure where an anchor is from the walls that can be seen from it, as with a tape.
 
 Everything is in the plan. Edges are the sides of obstacles that reach up to the anchor, and the
-lines of walls for mounts. If fewer than two of them are seen, the outline of the mounts serves, too.
+lines of walls for mounts. If fewer than two of them are seen, the outline of the mounts serves.
 """
 
 from __future__ import annotations
