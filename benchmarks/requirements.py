@@ -144,7 +144,7 @@ def measure(row: Tables, seed: int) -> Tables:
 
 def judge(row: Tables, anchors: np.ndarray) -> Tables:
     from rbl_gym.placement import scene_files
-    from rbl_gym.studies.placing import judging
+    from rbl_gym.studies.placing import judging, ranking
     from rbl_gym.studies.placing.accuracy import spread_places
     from rbl_gym.studies.placing.requirements import share_within, value_at_share
 
@@ -160,7 +160,7 @@ def judge(row: Tables, anchors: np.ndarray) -> Tables:
     needed = [one.zone.share for one in judged if one.asks]
     missing = [max(0.0, 1 - a / b) for a, b in zip(shares, needed, strict=True)]
     margin = min(1 / value_at_share(one.relative, one.zone.share) for one in judged if one.asks)
-    b = judging.overall_score([one.zone for one in judged], [one.errors.score for one in judged])
+    b = ranking.overall_score([one.zone for one in judged], [one.errors.score for one in judged])
     return {
         "anchors": len(anchors),
         "passed": sum(one == 0 for one in missing),

@@ -7,9 +7,9 @@ pytest.importorskip("shapely", reason="needs the extra placement")
 
 from rbl_gym.app import place_answer, place_figures, place_report, place_svg
 from rbl_gym.app import place_shapes as shapes
-from rbl_gym.app.place_notes import deciding_notes, nees_notes, usual_notes
+from rbl_gym.app.place_notes import deciding_notes, nees_notes, through_walls_notes, usual_notes
 from rbl_gym.placement import scene_files
-from rbl_gym.studies.placing import accuracy
+from rbl_gym.studies.placing import accuracy, check
 from rbl_gym.studies.placing.answer import Question, place_anchors
 from rbl_gym.studies.placing.judging import judge, short_row
 
@@ -70,6 +70,23 @@ def test_a_position_that_decides_with_one_anchor_less():
         "With 5 anchors, the horizontal position decides in zone 'a': at 95 % of the positions it "
         "is not determined."
     ]
+
+
+def test_bodies_that_reach_through_a_wall_are_counted():
+    # The zone ends at a thin wall; the tags are 0.3 m ahead and behind.
+    wall = {"line": [[11, 0], [11, 8]], "high_m": 3.0, "thickness_m": 0.02, "material": "glass"}
+    problem = scene_files.of_mapping(HALL | {"walls": [wall]})
+    checked = check.check_layout(problem, ANCHORS, 400, 0)
+    drawn = check.draw_bodies(problem, ANCHORS, 400, np.random.default_rng([0, 1]))
+    ahead = np.abs(0.3 * drawn.rotation[:, 0, 0])
+    through = (drawn.translation[:, 0] + ahead > 10.99).mean()
+    assert 0 < through < 0.05
+    assert checked["through_walls"] == [{"name": "hall", "share": through}]
+    (note,) = through_walls_notes({"check": checked, "tags_m": problem.tags.tolist()})
+    assert f"at {100 * through:.1f} % in 'hall' of the poses" in note
+    assert "the farthest tag is 0.30 m from the origin" in note
+    free = check.check_layout(scene_files.of_mapping(HALL), ANCHORS, 20, 0)
+    assert through_walls_notes({"check": free, "tags_m": [[0, 0, 0]]}) == []
 
 
 def layout(score_m, *verdicts):

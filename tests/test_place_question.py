@@ -24,7 +24,15 @@ from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import scene_files
-from rbl_gym.studies.placing import accuracy, choosing, contributions, judging, links, requirements
+from rbl_gym.studies.placing import (
+    accuracy,
+    choosing,
+    contributions,
+    judging,
+    links,
+    ranking,
+    requirements,
+)
 from tests.helpers import Told, needs
 
 # Ten brackets in a room of 12 x 8 m with a cupboard and a thin wall.
@@ -258,7 +266,7 @@ def test_one_more_anchor_goes_where_it_helps_most():
     assert found is not None
     place = found
     scores = {
-        k: judging.rank(judging.judge(problem, mounts(*chosen, k), 0, most=judging.PLACES))
+        k: ranking.rank(judging.judge(problem, mounts(*chosen, k), 0, most=judging.PLACES))
         for k in range(10)
         if k not in chosen
     }
@@ -275,7 +283,7 @@ def test_exchanges_meet_requirements_first_and_then_make_b_small():
     starts = [mounts(0, 1, 2, 3, 4, 6, 7), mounts(3, 4, 5, 6, 7, 8, 9)]
 
     def rank(anchors):
-        return judging.rank(judging.judge(problem, anchors, 0))
+        return ranking.rank(judging.judge(problem, anchors, 0))
 
     found = choosing.meeting(problem, starts, 0)
     np.testing.assert_array_equal(found, choosing.meeting(problem, starts, 0))

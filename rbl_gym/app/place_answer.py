@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from rbl_gym.app.place_notes import NAMES, deciding_notes, nees_notes, usual_notes
+from rbl_gym.app.place_notes import (
+    NAMES,
+    deciding_notes,
+    nees_notes,
+    through_walls_notes,
+    usual_notes,
+)
 
 # Verdicts also have a sign and a word, because not everyone can distinguish colours.
 SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? TOO CLOSE", "no requirement": "-"}
@@ -78,7 +84,7 @@ def warnings(result: dict[str, Any]) -> list[str]:
                 f"{percent(zone['required']['share'])} must be. Treat it as not met: add an "
                 "anchor, or require a little less."
             )
-    return found + _contradictions(result) + nees_notes(result)
+    return found + _contradictions(result) + nees_notes(result) + through_walls_notes(result)
 
 
 def _way_out(result: dict[str, Any]) -> str:

@@ -102,6 +102,24 @@ def _passed(row: dict[str, Any]) -> int:
     return sum(zone["verdict"] == "pass" for zone in row["zones"])
 
 
+def through_walls_notes(result: dict[str, Any]) -> list[str]:
+    """Return a note if bodies of the check have tags inside obstacles or behind walls."""
+    found = [
+        f"{100 * row['share']:.1f} % in {row['name']!r}"
+        for row in result["check"].get("through_walls", [])
+        if row["share"] > 0
+    ]
+    if not found:
+        return []
+    reach = max(math.hypot(*tag) for tag in result["tags_m"])
+    return [
+        "Some bodies of the check reach through a wall or an obstacle: a tag is inside it or "
+        f"behind it, at {', '.join(found)} of the poses. A zone is where the body's origin may be. Their "
+        "figures count, but the robot cannot be there. If this matters, keep the zone away from "
+        f"walls and obstacles: the farthest tag is {reach:.2f} m from the origin."
+    ]
+
+
 def nees_notes(result: dict[str, Any]) -> list[str]:
     """Return a note on each filter that agrees with the bound but claims too small errors."""
     trials = result["check"].get("trials", 1)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
 from rbl_gym.app.place_answer import WORDS, typical
+from rbl_gym.app.place_loss import loss_tables
 from rbl_gym.app.place_survey import survey_table
 
 # Fractions of lost bodies above this are mentioned.
@@ -25,7 +26,7 @@ class Rows(NamedTuple):
 def tables(result: dict[str, Any]) -> Iterator[Rows]:
     """Return all tables of a result, starting with the requirements."""
     yield _zones(result)
-    yield from any_loss_rows(result)
+    yield from (Rows(*one) for one in loss_tables(result["zones"]))
     if "fewest" in result:
         yield from fewest_rows(result["fewest"])
     yield anchor_rows(result)
@@ -132,27 +133,6 @@ def _zones(result: dict[str, Any]) -> Rows:
     if any(row[-1] is not None for row in rows):
         return Rows(title(result), [*headings, "worst without"], [_texts(row) for row in rows])
     return Rows(title(result), headings, [_texts(row[:-1]) for row in rows])
-
-
-def any_loss_rows(result: dict[str, Any]) -> Iterator[Rows]:
-    """Return the errors after the worst loss at each position, if any one anchor may fail."""
-    zones = [zone for zone in result["zones"] if "any_loss" in zone]
-    if not zones:
-        return
-    rows = []
-    for zone in zones:
-        lost = zone["any_loss"]
-        figures = [
-            digits(lost[key][what], 3)
-            for key in ("position_m", "heading_deg")
-            for what in ("median", "p95", "worst")
-        ]
-        rows.append([zone["name"], _percent(lost["share"]) if "share" in lost else "-", *figures])
-    headings = [
-        "zone", "within after any loss",
-        "horizontal median (m)", "p95", "worst", "heading median (deg)", "p95", "worst",
-    ]  # fmt: skip
-    yield Rows("after the loss of the anchor that hurts most at each place", headings, rows)
 
 
 def title(result: dict[str, Any]) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 
 from rbl_gym.app.page import digits
 from rbl_gym.app.place_answer import HOW_TO_ASK, WORDS, percent, warnings
+from rbl_gym.app.place_loss import loss_tables
 from rbl_gym.app.place_report import (
     Rows,
     anchor_rows,
-    any_loss_rows,
     fewest_rows,
     layout_rows,
     notes,
@@ -57,7 +57,7 @@ def _count(number: int) -> str:
 def short_tables(result: dict[str, Any]) -> Iterator[Rows]:
     """Return the tables that answer the question."""
     yield _zones(result)
-    yield from any_loss_rows(result)
+    yield from (Rows(*one) for one in loss_tables(result["zones"]))
     if "fewest" in result:
         yield from fewest_rows(result["fewest"])
     if "against_number" in result:

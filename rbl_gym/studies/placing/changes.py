@@ -9,8 +9,9 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing.choosing import next_anchor
-from rbl_gym.studies.placing.judging import Judged, judge_beside, overall_score, short_row, verdict
+from rbl_gym.studies.placing.judging import Judged, judge_beside, short_row, verdict
 from rbl_gym.studies.placing.out_of_plane import exchange_out_of_plane
+from rbl_gym.studies.placing.ranking import overall_score
 
 
 def with_next(

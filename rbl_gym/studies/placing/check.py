@@ -116,8 +116,24 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
         "trials": trials,
         "prior_rotation_deg": float(np.rad2deg(problem.scene.initial_rotation_rad)),
         "prior_position_m": problem.scene.initial_translation_m,
+        "through_walls": _through_walls(problem, drawn),
         "filters": result,
     }
+
+
+def _through_walls(problem: Problem, drawn: DrawnBodies) -> list[dict[str, Any]]:
+    """Return the share of the bodies of each zone with a tag inside an obstacle or behind a wall.
+
+    Positions are free for the origin of the body only. Such a body would reach through a wall.
+    """
+    tags = ranging.tag_positions(drawn.rotation, drawn.translation, problem.tags)
+    behind = ~problem.obstacles.sees(drawn.translation[:, None], tags)[..., 0]
+    through = (behind | problem.obstacles.contain(tags)).any(axis=-1)
+    return [
+        {"name": zone.name, "share": float(through[drawn.zone == k].mean())}
+        for k, zone in enumerate(problem.zones)
+        if (drawn.zone == k).any()
+    ]
 
 
 def _located(

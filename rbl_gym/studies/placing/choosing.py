@@ -11,8 +11,9 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.sample import prior_of
 from rbl_gym.studies.placing.accuracy import spread_places
-from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of, rank
+from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
 from rbl_gym.studies.placing.links import anchor_information
+from rbl_gym.studies.placing.ranking import rank
 from rbl_gym.studies.placing.requirements import Limits, turns, value_at_share
 from rbl_gym.studies.placing.stock_search import (
     Stock,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from rbl_gym.studies.monte_carlo import rms
-from rbl_gym.studies.placing.judging import Judged, limits_of, overall_score, told
+from rbl_gym.studies.placing.judging import Judged, limits_of, told
+from rbl_gym.studies.placing.ranking import overall_score
 from rbl_gym.studies.placing.requirements import Errors, relative_errors, share_within
 
 __all__ = ["without_each"]

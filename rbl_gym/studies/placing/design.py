@@ -12,7 +12,7 @@ from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.placement import amortised, design, layouts
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.problem import Context
-from rbl_gym.studies.placing import judging
+from rbl_gym.studies.placing import ranking
 from rbl_gym.studies.progress import Advance, silent
 
 __all__ = ["STARTS", "Design", "design_layout", "usual_layouts"]
@@ -81,7 +81,7 @@ def design_layout(
         if not problem.obstacles.contain(anchors).any()
     }
     # Evaluated at more positions than the search has used.
-    scores = {name: judging.score_of(problem, x, seed) for name, x in legal.items()}
+    scores = {name: ranking.score_of(problem, x, seed) for name, x in legal.items()}
     best = min(scores, key=scores.__getitem__)
     ordered = _in_order(legal[best][len(fixed) :], problem.context.centre)
     return Design(np.concatenate([fixed, ordered]), best, searched)
