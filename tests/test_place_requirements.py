@@ -226,8 +226,8 @@ def test_exchanges_come_close_to_the_best_of_all_choices(survive):
         assert least - 1e-9 <= reached <= first + 1e-9
         # A tenth of the shortfall, or of b.
         close.append(reached <= least + 0.1)
-    # Exchanges of single anchors may stop before the best choice.
-    assert sum(close) >= 4
+    # Exchanges of single anchors may stop before the best choice, mostly of layouts that survive.
+    assert sum(close) >= (3 if survive else 5)
 
 
 def test_kept_anchors_stay():

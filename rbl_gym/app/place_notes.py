@@ -114,9 +114,9 @@ def through_walls_notes(result: dict[str, Any]) -> list[str]:
     reach = max(math.hypot(*tag) for tag in result["tags_m"])
     return [
         "Some bodies of the check reach through a wall or an obstacle: a tag is inside it or "
-        f"behind it, at {', '.join(found)} of the poses. A zone is where the body's origin may be. Their "
-        "figures count, but the robot cannot be there. If this matters, keep the zone away from "
-        f"walls and obstacles: the farthest tag is {reach:.2f} m from the origin."
+        f"behind it, at {', '.join(found)} of the poses. A zone is where the body's origin may be. "
+        "Their figures count, but the robot cannot be there. If this matters, keep the zone away "
+        f"from walls and obstacles: the farthest tag is {reach:.2f} m from the origin."
     ]
 
 

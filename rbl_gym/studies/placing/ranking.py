@@ -9,7 +9,7 @@ from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.placing.judging import PLACES, Judged, judge, verdict
 from rbl_gym.studies.placing.requirements import shortfall
 
-__all__ = ["overall_score", "rank", "score_of"]
+__all__ = ["rank"]
 
 
 def rank(judged: list[Judged]) -> tuple[bool, float, float]:
