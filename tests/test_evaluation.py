@@ -16,7 +16,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import Context, layouts, search
-from rbl_gym.studies.learning import evaluation, policies, rollouts, training, transfer
+from rbl_gym.studies.learning import evaluation, left_out, policies, rollouts, training, transfer
 from rbl_gym.studies.learning.policies import AnyPolicy
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
 from rbl_gym.studies.progress import silent
@@ -360,7 +360,7 @@ def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
 
 
 def test_without_cmaes_its_references_are_skipped(monkeypatch, capsys):
-    monkeypatch.setattr(evaluation, "find_spec", lambda name: None)
+    monkeypatch.setattr(left_out, "find_spec", lambda name: None)
     arguments = ["evaluate", "auv_buoys", "--worlds", "2", "--references", "ring", "--json"]
     assert main(arguments) == 0
     told = capsys.readouterr()

@@ -13,6 +13,7 @@ import pytest
 from rbl_gym.placement import scene_files
 from rbl_gym.placement.plans import geojson
 from rbl_gym.studies.placing.layout_export import LAYER, SUFFIXES, mounting_list, write_layout
+from rbl_gym.studies.placing.tape import measured_from
 from tests.helpers import needs
 from tests.plan_files import write_dxf
 
@@ -98,9 +99,11 @@ ROOMS: dict[str, Any] = {
 )  # fmt: skip
 def test_distances_are_to_walls_that_are_seen_from_the_anchor(anchor, found):
     rooms = scene_files.of_mapping(ROOMS)
-    (row,) = mounting_list(rooms, np.array([anchor]))
+    place = np.array(anchor)
+    measured = measured_from(rooms, place, rooms.mounts.normal(place))
+    assert mounting_list(rooms, place[None])[0]["measured"] == measured
     keys = ("side", "to", "distance_m", "x_m", "y_m")
-    assert [tuple(one[key] for key in keys) for one in row["measured"]] == found
+    assert [tuple(one[key] for key in keys) for one in measured] == found
 
 
 def test_a_ceiling_without_walls_is_measured_from_its_edges():

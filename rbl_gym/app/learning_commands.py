@@ -189,11 +189,12 @@ def _command(options: argparse.Namespace, steps: int, algorithm: str) -> str:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import evaluation
+    from rbl_gym.studies.learning.left_out import left_out
 
     task, title, loaded = _played(options)
     named = _references(options, task, [])
     _require_searches({*named})
-    if skipped := evaluation.skipped_references(task, named):
+    if skipped := left_out(evaluation.references(task), named):
         print(f"skipped: {', '.join(skipped)}: pip install 'rbl-gym[placement]'", file=sys.stderr)
     names = named or None
     with progress(title) as advance:

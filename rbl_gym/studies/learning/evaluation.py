@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import layouts, search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.learning import rollouts
+from rbl_gym.studies.learning.left_out import left_out
 from rbl_gym.studies.learning.own_policies import PolicyLike, policies_by_label
 from rbl_gym.studies.learning.policies import check_fit
 from rbl_gym.studies.learning.rl_tasks import RlTask, task_of
@@ -31,7 +31,6 @@ __all__ = ["Layouts", "evaluate", "held_out_returns", "layouts_of", "references"
 
 # The reference with one layout for all contexts, and the number of contexts for its search.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
-_OF_CMAES = (_ONE_LAYOUT, "cma-es")
 # Row of the best layouts of the strongest searches.
 BEST_KNOWN = "best-known"
 # Random layouts of each context, and gradient evaluations that refine a policy's layout.
@@ -51,12 +50,6 @@ def references(task: RlTask) -> list[str]:
         one = [] if "scenes" in task.arguments else [_ONE_LAYOUT]
         return [*layouts.LAYOUTS, *one, *others, *last]
     return list(_controllers(task))
-
-
-def skipped_references(task: RlTask, named: Sequence[str]) -> list[str]:
-    """Return the references that are left out: not named, and without the package they need."""
-    lacking = () if find_spec("cmaes") else _OF_CMAES
-    return [name for name in references(task) if name in lacking and name not in named]
 
 
 def strongest(task: RlTask) -> list[str]:
@@ -130,7 +123,7 @@ def evaluate(
     ['random', 'nearest', 'greedy-with-map', 'policy']
     """
     task, policies = task_of(task), policies_by_label(policies)
-    skipped = skipped_references(task, names or ())
+    skipped = left_out(references(task), names or ())
     known = [name for name in references(task) if name not in skipped]
     names = [check_one_of("reference", name, known) for name in (known if names is None else names)]
     best_of = [name for name in strongest(task) if name not in skipped]

@@ -14,10 +14,11 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.geometry.obstacles import box_bounds
+from rbl_gym.geometry.polygons import area, contains, rectangle
 from rbl_gym.placement.building import Problem
 
-__all__ = ["direction", "floor_below", "measured_from"]
+__all__ = ["measured_from"]
 
 # An obstacle is a floor slab if it is at most this thick and at least this large. Floors above z =
 # 0 begin on one.
@@ -163,15 +164,11 @@ def _at_right_angles(
 
 def _edges(problem: Problem, anchor: FloatArray) -> FloatArray:
     """Return edges (K, 2, 2) of the obstacles that reach an anchor, and of mounts on walls."""
-    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
+    prisms = problem.obstacles.prisms
+    lows, highs = box_bounds(problem.obstacles.boxes)
     z = float(anchor[2])
     head = min(z - 1e-6, max(z - _BELOW_M, floor_below(problem, anchor) + _FURNITURE_M))
-    rings = [
-        box[:2] + turns * box[3:5]
-        for box in boxes
-        if box[2] - box[5] < z and box[2] + box[5] > head
-    ]
+    rings = list(rectangle(lows, highs)[(lows[:, 2] < z) & (highs[:, 2] > head)])
     for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
         if low < z and high > head:
             rings.append(ring)
