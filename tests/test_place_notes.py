@@ -83,7 +83,7 @@ def test_bodies_that_reach_through_a_wall_are_counted():
     assert 0 < through < 0.05
     assert checked["through_walls"] == [{"name": "hall", "share": through}]
     (note,) = through_walls_notes({"check": checked, "tags_m": problem.tags.tolist()})
-    assert f"at {100 * through:.1f} % in 'hall' of the poses" in note
+    assert f"at {100 * through:.1f} % of the poses in 'hall'" in note
     assert "the farthest tag is 0.30 m from the origin" in note
     free = check.check_layout(scene_files.of_mapping(HALL), ANCHORS, 20, 0)
     assert through_walls_notes({"check": free, "tags_m": [[0, 0, 0]]}) == []

@@ -189,6 +189,18 @@ def test_the_report_is_the_same_for_the_same_result(placed, tmp_path, monkeypatc
     assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
 
 
+def test_a_label_has_a_line_to_its_marker_if_it_is_far_or_another_marker_is_near():
+    size, points = np.array([20.0, 10.0]), np.array([[0.0, 0.0], [30.0, 0.0], [300.0, 0.0]])
+    for place, point, needed in (
+        ([-14.0, 0.0], points[0], False),
+        ([15.0, 0.0], points[0], True),  # as near to the second marker
+        ([330.0, 0.0], points[2], True),  # 20 away from its own
+        ([314.0, 0.0], points[2], False),
+    ):
+        found = shapes.needs_leader(np.array(place), size, point, points, 10.0)
+        assert found == needed, place
+
+
 def test_maps_have_no_holes_where_a_wall_crosses(placed):
     maps = shapes.maps_of(placed)
     for zone, one in zip(placed.problem.zones, maps, strict=True):

@@ -18,6 +18,8 @@ from rbl_gym.placement.scene_files import Problem
 
 MOUNT, ANCHOR, KEPT, ZONE = "#7b3294", "#111111", "#6b6b6b", "#222222"
 COLOURS = "viridis_r"
+# Labels of more anchors than this are without heights, so that they fit; the list has the heights.
+_MOST_HEIGHTS = 16
 _WHITE = {"boxstyle": "round,pad=0.18", "fc": "white", "ec": "0.75", "lw": 0.5, "alpha": 0.92}
 
 
@@ -97,7 +99,7 @@ def draw_anchors(
         axes.plot(*place, marker, ms=8, color=colour, mec="white", mew=0.9, zorder=7, clip_on=False)
         if outside:
             text += f"  {np.linalg.norm(anchor - 0.5 * (low + high)):.3g} m away"
-        elif heights:
+        elif heights and len(anchors) <= _MOST_HEIGHTS:
             text += f"  z {anchor[2]:.3g}"
         note = axes.annotate(
             text,
@@ -137,9 +139,9 @@ def settle_labels(figure: Any, groups: list[tuple[Any, list[Any]]]) -> None:
         edges = np.array(axes.get_window_extent(renderer).get_points())
         edges += np.array([[-14.0], [14.0]]) * unit
         found = shapes.spread_labels(points, np.array(sizes), edges, 4.0 * unit, boxes)
-        for text, place, point, size in zip(texts, found, points, sizes, strict=True):
+        for text, place, point, size in zip(texts, found, points, np.array(sizes), strict=True):
             text.set_position(to_pixels.inverted().transform(place))
-            if np.abs(place - point).max() > 0.5 * max(size) + 10 * unit:
+            if shapes.needs_leader(place, size, point, points, 10 * unit):
                 axes.plot(
                     *to_pixels.inverted().transform([place, point]).T,
                     color="0.25",

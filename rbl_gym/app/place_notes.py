@@ -105,7 +105,7 @@ def _passed(row: dict[str, Any]) -> int:
 def through_walls_notes(result: dict[str, Any]) -> list[str]:
     """Return a note if bodies of the check have tags inside obstacles or behind walls."""
     found = [
-        f"{100 * row['share']:.1f} % in {row['name']!r}"
+        f"{100 * row['share']:.1f} % of the poses in {row['name']!r}"
         for row in result["check"].get("through_walls", [])
         if row["share"] > 0
     ]
@@ -114,7 +114,7 @@ def through_walls_notes(result: dict[str, Any]) -> list[str]:
     reach = max(math.hypot(*tag) for tag in result["tags_m"])
     return [
         "Some bodies of the check reach through a wall or an obstacle: a tag is inside it or "
-        f"behind it, at {', '.join(found)} of the poses. A zone is where the body's origin may be. "
+        f"behind it, at {', '.join(found)}. A zone is where the body's origin may be. "
         "Their figures count, but the robot cannot be there. If this matters, keep the zone away "
         f"from walls and obstacles: the farthest tag is {reach:.2f} m from the origin."
     ]

@@ -97,6 +97,10 @@ def notes(result: dict[str, Any]) -> list[str]:
         "pose; found: share of bodies with an error below the limit that a consistent filter "
         "exceeds once in a million.",
     ]
+    found.append(
+        "Mounting list: left and right are as you face the wall; other distances are at right "
+        "angles to the wall. The point of the wall can be seen from the anchor."
+    )
     for name, figures in check["filters"].items():
         if 1 - figures["found"] > _MANY_LOST:
             found.append(

@@ -316,5 +316,19 @@ def spread_labels(
     return np.array(placed).reshape(-1, 2)
 
 
+def needs_leader(
+    place: FloatArray, size: FloatArray, point: FloatArray, points: FloatArray, far: float
+) -> bool:
+    """Return whether a label needs a line to its marker: it is far, or near another marker, too.
+
+    `place` and `size` are centre and size of the label, `point` its marker, `points` (K, 2) the
+    markers of all labels, `far` the distance beyond the label that is far; all in pixels.
+    """
+    gaps = np.linalg.norm(np.maximum(np.abs(points - place) - 0.5 * size, 0.0), axis=-1)
+    own = (points == point).all(axis=-1)
+    gap = gaps[own].min()
+    return bool(gap > far or (gaps[~own] < 1.5 * gap).any())
+
+
 def _overlap(a: FloatArray, half_a: FloatArray, b: FloatArray, half_b: Any) -> bool:
     return bool((np.abs(a - b) < half_a + half_b - 0.5).all())
