@@ -140,18 +140,18 @@ def _loading_alone() -> Iterator[None]:
     """
     try:
         from numba.core.caching import Cache
-        from numba.core.runtime import rtsys
+        from numba.core.runtime.nrt import rtsys
     except ImportError:  # private names of numba
         yield
         return
     find: Any = Cache.load_overload
 
-    def load_overload(self: Any, signature: Any, target: Any) -> Any:
-        target.refresh = lambda: rtsys.initialize(target)
+    def load_overload(self: Any, sig: Any, target_context: Any) -> Any:
+        target_context.refresh = lambda: rtsys.initialize(target_context)
         try:
-            return find(self, signature, target)
+            return find(self, sig, target_context)
         finally:
-            del target.refresh  # deletes the attribute of the instance
+            del target_context.refresh  # deletes the attribute of the instance
 
     Cache.load_overload = load_overload
     try:

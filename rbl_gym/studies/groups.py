@@ -38,7 +38,7 @@ class Steps(NamedTuple):
     def each(self) -> Iterator[Step]:
         """Yield the step of each epoch."""
         for k, reading in enumerate(each(self.reading)):
-            yield Step(*(type(part)(*(a[k] for a in part)) for part in self[:3]), reading)
+            yield Step(_at(self.predicted, k), _at(self.state, k), _at(self.belief, k), reading)
 
 
 def track_log(
@@ -100,7 +100,8 @@ def _tracked(
     if count == 0:
         return None
     first = slice(count)
-    return Steps(*(_at(states, first) for states in (*found, belief)), _part(part, first))
+    before, after = (_at(states, first) for states in found)
+    return Steps(before, after, _at(belief, first), _part(part, first))
 
 
 def beliefs_of(steps: Iterable[Step | Steps]) -> PoseBelief:
@@ -165,9 +166,9 @@ def _grouped(steps: Iterable[Step | Steps], noise: NoiseLaw) -> Iterator[Steps]:
 
 
 def _stacked(steps: list[Step], noise: NoiseLaw) -> Steps:
+    columns: list[list[Any]] = [[step[part] for step in steps] for part in range(3)]
     predicted, state, belief = (
-        type(column[0])(*map(np.array, zip(*column, strict=True)))
-        for column in ([step[part] for step in steps] for part in range(3))
+        type(column[0])(*map(np.array, zip(*column, strict=True))) for column in columns
     )
     readings = [step.reading for step in steps]
     ranges = np.array([reading.ranges for reading in readings])
