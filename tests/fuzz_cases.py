@@ -151,7 +151,8 @@ PLACES = {"anchors": ANCHORS, "tags": TAGS, **POSE, "noise": NOISE}
 LINKS, LINK_MODEL = EPOCH["links"], ranging.LinkModel(0.1, nlos_probability=0.1)
 case(bounds.range_information, **PLACES, links=LINKS, tag_std_m=0.01)
 case(links.expected_information, **PLACES, link_model=LINK_MODEL, nlos_std_m=1.0)
-case(links.realised_crb, **PLACES, link_model=LINK_MODEL, rng=Rng, draws=3)
+case(links.realised_crb, **PLACES, link_model=LINK_MODEL, rng=Rng, draws=3,
+     prior_information=np.eye(6))  # fmt: skip
 case(links.nlos_efficiency, probability=0.1, bias_m=5.0, std_m=0.1, bias_std_m=1.0)
 case(bounds.range_information, "anchor_std_m", **PLACES, anchor_std_m=np.full(5, 0.1))
 case(bounds.Nuisances, anchor_std_m=0.1)

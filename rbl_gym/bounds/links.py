@@ -93,6 +93,7 @@ def realised_crb(
     link_model: ranging.LinkModel,
     rng: np.random.Generator,
     draws: int = 1000,
+    prior_information: ArrayLike | None = None,
 ) -> FloatArray:
     """Return the Cramer-Rao bound (..., 6, 6), averaged over draws of the measured links.
 
@@ -112,7 +113,7 @@ def realised_crb(
     links = rng.random((draws, *distance.shape)) >= link_model.drop_probability
     if link_model.reach_m is not None:
         links &= distance <= link_model.reach_m
-    covariance = bounds.pose_crb(*places, noise, links=links)
+    covariance = bounds.pose_crb(*places, noise, prior_information, links)
     return covariance.mean(axis=0)
 
 
