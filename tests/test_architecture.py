@@ -19,16 +19,7 @@ import pytest
 from tests.helpers import ROOT, needs, run_python
 
 FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
-PLAIN_MODELS = {
-    "bounds",
-    "checks",
-    "components",
-    "geometry",
-    "kernels",
-    "measurements",
-    "motion",
-    "networks",
-}
+PLAIN_MODELS = {"bounds", "checks", "geometry", "kernels", "measurements", "motion", "networks"}
 # numpy.random's names that are no global state.
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
 

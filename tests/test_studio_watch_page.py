@@ -77,7 +77,7 @@ def test_it_plays_seeks_and_begins_anew(served):
     page.seek(4)
     page.settle()
     assert (page.at, len(page.frames)) == (4, count)
-    page.begin(("uc-kf",), 5)
+    page.restart(("uc-kf",), 5)
     page.settle()
     assert len(page.frames) == 1
     assert [track.label for track in page.frames[0].tracks] == ["uc-kf"]
@@ -87,7 +87,7 @@ def test_it_plays_seeks_and_begins_anew(served):
 def test_a_filter_that_does_not_fit_leaves_the_page_as_it_was(served):
     page = served.page
     page.step()
-    page.begin(("iekf-imu",), 0)
+    page.restart(("iekf-imu",), 0)
     page.settle()
     assert "inertial" in page.status
     assert len(page.frames) == 2

@@ -18,7 +18,7 @@ __all__ = ["KINDS", "Scenery", "Tokens", "tokens_of"]
 KINDS = ("box", "shell", "walls", "mounts")
 # Cells of the plan of the zones, in x and in y, for the views of candidates.
 _CELLS = 3
-# Lengths of zero, and noise that does not grow, are replaced by this fraction of the unit.
+# Added to the growth of the noise, whose logarithm is then finite without growth.
 _LEAST = 1e-6
 
 

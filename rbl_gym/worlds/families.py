@@ -135,8 +135,8 @@ class SceneFamily:
     ) -> tuple[Scene, dict[str, Any]]:
         """Draw a scene; return it with its overrides (for `rbl_gym.worlds.scenes.get`).
 
-        `member` is the index of the member to draw from; None draws the member too. The overrides
-        of a member that is a `Scene` are only its name.
+        `index` is that of the member to draw from; None draws the member too. The overrides of a
+        member that is a `Scene` are only its name.
         """
         if index is None:
             index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0

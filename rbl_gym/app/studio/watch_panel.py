@@ -31,8 +31,8 @@ OFFERED = (
 )
 # Error of the wrong anchor position in metres, and the factor on the noise.
 WRONG_M, NOISIER = 0.5, 2.0
-# Epochs over which the table averages NIS, and the maximum length of the charts.
-_RECENT, _CHARTED = 10, 300
+# Epochs over which the table averages NIS.
+_RECENT = 10
 # Mean NIS per degree of freedom above which a filter is overconfident.
 _TOO_SURE = 1.5
 _CSS = (
@@ -195,14 +195,14 @@ class WatchPanel:
 
     # # --- content ---------------------------------------------------------------------------
 
-    def show(self, frames: Sequence[Frame], at: int, playing: bool, status: str) -> None:
-        """Show a frame, and charts of the frames before it."""
-        self._table.content = headline(self._program.title, frames[: at + 1])
+    def show(self, past: Sequence[Frame], at: int, count: int, playing: bool, status: str) -> None:
+        """Show the figures of the last of the frames, which is number `at` of `count`."""
+        self._table.content = headline(self._program.title, past)
         icon, label = ("player-pause", "Pause") if playing else ("player-play", "Play")
         if self._play.label != label:
             self._play.label, self._play.icon = label, icon
-        if self._time.max != max(len(frames) - 1, 1):
-            self._time.max = max(len(frames) - 1, 1)
+        if self._time.max != max(count - 1, 1):
+            self._time.max = max(count - 1, 1)
         if self._time.value != at:
             self._time.value = at
         self._status.content = f'<div style="{_CSS}">{html.escape(status)}</div>'
@@ -215,10 +215,9 @@ class WatchPanel:
                 handle.value = value
 
     def chart(self, frames: Sequence[Frame]) -> None:
-        """Show the last of these frames in the charts."""
-        shown = frames[-_CHARTED:] if self._charts else ()
+        """Show these frames in the charts."""
         for chart, (least, of) in zip(self._charts, CHARTS.values(), strict=False):
-            chart.data = self._curves(shown, least, of)[0]
+            chart.data = self._curves(frames, least, of)[0]
 
     def name_filters(self, labels: tuple[str, ...]) -> None:
         """Replace the names of the filters."""

@@ -91,13 +91,12 @@ class WatchView:
         self._bodies: list[str] = []
         self._places: dict[str, FloatArray] = {}
 
-    def show(
-        self, frame: Frame, way: Sequence[Frame], which: int, aspect: float | None = None
-    ) -> None:
-        """Draw a frame, the paths of the frames before it, and the links as a filter uses them.
+    def show(self, past: Sequence[Frame], which: int, aspect: float | None = None) -> None:
+        """Draw the last of the frames, the paths up to it, and the links as a filter uses them.
 
         `aspect` is the aspect ratio of the window, for pictures; None if it is not known.
         """
+        frame = past[-1]
         if frame.picture is not None:
             picture = frame.picture if aspect is None else letterbox(frame.picture, aspect)
             self._scene.set_background_image(picture, format="png")
@@ -116,7 +115,7 @@ class WatchView:
         for number, name in enumerate(LINKS):
             found = links.get(name, np.empty((0, 2, 3)))
             self._lines(f"/links/{number}", found, LINK_COLOURS[number], LINK_WIDTHS[number])
-        self._show_ways(frame, way[-_WAY:])
+        self._show_ways(past[-_WAY:])
 
     def clear(self) -> None:
         """Remove all drawn objects."""
@@ -191,11 +190,11 @@ class WatchView:
         handle.position = tuple(track.belief.translation)
         handle.wxyz = tuple(rotations.quaternion(found.rotation))
 
-    def _show_ways(self, frame: Frame, way: Sequence[Frame]) -> None:
+    def _show_ways(self, way: Sequence[Frame]) -> None:
         paths: dict[str, tuple[list[FloatArray], Any]] = {
             "/way/truth": ([f.truth.translation for f in way if f.truth is not None], TRUTH)
         }
-        for k in range(len(frame.tracks)):
+        for k in range(len(way[-1].tracks)):
             paths[f"/way/{k}"] = ([f.tracks[k].belief.translation for f in way], FILTERS[k])
         for name, (places, colour) in paths.items():
             path = np.array(places).reshape(-1, 3)

@@ -97,7 +97,9 @@ def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, 
         Q, p, ok = truth_at(truth, run.times + shift, settings.truth_gap_s)
         still = truth.times[-1] - truth.times[0] > 0 and not np.ptp(truth.translation, axis=0).any()
         if still and (truth.rotation is None or not np.ptp(truth.rotation, axis=0).any()):
-            ok = np.ones_like(ok)  # a body at rest is also at rest shortly before and after
+            # A body at rest is also at rest in gaps of its truth, and shortly before and after.
+            early, late = truth.times[0] - _SEARCH_S, truth.times[-1] + _SEARCH_S
+            ok = (run.times + shift >= early) & (run.times + shift <= late)
         Q = np.broadcast_to(np.eye(3), (len(p), 3, 3)) if Q is None else Q
         if settings.planar:
             Q = rotations.exp(rotations.yaw(Q)[:, None] * np.array([0.0, 0.0, 1.0]))
