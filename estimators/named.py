@@ -1,16 +1,21 @@
-"""Named filters of the pose and other states."""
+"""The filters ``"iekf"``, ``"iekf-cv"``, ``"iekf-bias"`` and ``"iekf-log"`` by their options."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from rbl_gym.checks import FloatArray, check_count
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_count, check_one_of
 from rbl_gym.estimators.bank.headings import HeadingBank
 from rbl_gym.estimators.filter import Filter, register
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.iekf.clock import ClockEkf
+from rbl_gym.estimators.iekf.doa_filter import DoaEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.odometry import OdometryEkf
+from rbl_gym.estimators.iekf.surveyed import SurveyedEkf
 from rbl_gym.measurements.direction_bias import DirectionLaw
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.odometry import OdometrySensor
@@ -18,6 +23,51 @@ from rbl_gym.measurements.offsets import Clock
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
+
+
+def iekf(
+    tags: FloatArray,
+    noise: Any,
+    process: ProcessNoise,
+    iterations: int = 4,
+    robust: bool | str = False,
+    measurement: str = "ranges",
+    range_noise: NoiseLaw | None = None,
+    offset: str | None = None,
+    clock: Clock | None = None,
+    anchor_std_m: ArrayLike | None = None,
+) -> IteratedEkf | AugmentedEkf | ClockEkf:
+    """Return the filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
+
+    Parameters
+    ----------
+    measurement
+        ``"ranges"`` or ``"doa"``; `noise` is their law.
+    range_noise
+        For ``"doa"``: the law of additional ranges of an update.
+    tags, process, iterations, robust, offset
+        As in `IteratedEkf`.
+    clock
+        Law of lasting offsets, instead of `offset`: their clocks become states (`ClockEkf`).
+    anchor_std_m
+        Standard deviation of the anchor positions: they become states (`SurveyedEkf`).
+    """
+    check_one_of("measurement", measurement, ("ranges", "doa"))
+    if measurement == "doa":
+        for name, told in (("offset", offset), ("clock", clock), ("anchor_std_m", anchor_std_m)):
+            if told is not None:
+                raise ValueError(f"{name} must be None with angles, got {told!r:.80}")
+        return DoaEkf(tags, noise, process, iterations, robust, range_noise=range_noise)
+    if range_noise is not None:
+        raise ValueError(
+            "range_noise must be None with measurement='ranges', as noise is the law of the ranges"
+        )
+    filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
+    if anchor_std_m is None:
+        return filter if clock is None else ClockEkf(filter, clock=clock)
+    if clock is not None:
+        raise ValueError(f"clock must be None with anchor_std_m, got {clock!r:.80}")
+    return SurveyedEkf(filter, anchor_std_m=anchor_std_m)
 
 
 def iekf_cv(
@@ -154,6 +204,7 @@ def iekf_log(
     return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
 
 
+register("iekf", iekf)
 register("iekf-cv", iekf_cv)
 register("iekf-bias", iekf_bias)
 register("iekf-log", iekf_log)

@@ -204,7 +204,7 @@ def test_information(law, batch, common, m, n):
     world = World(batch, m, n, common)
     for share in (world.share, np.ones((m, n)), np.zeros((m, n), bool)):
         assert_equal_forms(
-            information.link_information, np.eye(6), *world.places, law.numbers, share
+            information.add_range_information, np.eye(6), *world.places, law.numbers, share
         )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import check_array, check_number
 from rbl_gym.estimators.costs.losses import LATE, huber, loss_of
+from rbl_gym.kernels.constants import HUBER
 
 __all__ = ["range_track"]
 
@@ -17,7 +18,6 @@ _KNOT_S, _ACCELERATION = 0.2, 2.0
 # Standard deviations of the bias of a link, and of the common bias (m).
 _LINK_M, _COMMON_M = 0.1, 0.2
 _ITERATIONS, _CONVERGED_M = 25, 2e-3
-_HUBER = 1.5
 
 
 def range_track(
@@ -91,7 +91,7 @@ def range_track(
     if isinstance(start, scipy.interpolate.BSpline):
         first = start.c  # pyright: ignore[reportAttributeAccessIssue]
     else:
-        first, losses = check_array("start", start, (3,)) + np.zeros((m, 3)), [huber(_HUBER), LATE]
+        first, losses = check_array("start", start, (3,)) + np.zeros((m, 3)), [huber(HUBER), LATE]
     x = np.append(first.T, np.zeros(count))
     for loss in losses:
         for _ in range(_ITERATIONS):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.kernels.constants import CUTOFF, LATE_HUBER, LATE_SHARE, SCALE
 
 # A loss is five numbers (..., 5). Threshold, cutoff and scale are infinite if not used. The others
 # are the power by which weights fall beyond the threshold, and the factor on the weight of a late
@@ -30,16 +31,16 @@ def redescending(threshold: float, late: float = 0.5) -> FloatArray:
 
 def cut_huber(threshold: float, cutoff: ArrayLike) -> FloatArray:
     """Return Huber's loss up to `cutoff` (...) standard deviations, constant (weight 0) beyond."""
-    return _stacked(huber(threshold), 1, cutoff)
+    return _stacked(huber(threshold), CUTOFF, cutoff)
 
 
 def geman_mcclure(scale: ArrayLike) -> FloatArray:
     """Return the bounded Geman-McClure loss; residuals far beyond `scale` (...) hardly count."""
-    return _stacked(SQUARES, 2, scale)
+    return _stacked(SQUARES, SCALE, scale)
 
 
-# For radio ranges: chosen on several public logs, whose errors hardly change from 0.8 to 1.
-LATE = redescending(1.0, late=0.5)
+# For radio ranges.
+LATE = redescending(LATE_HUBER, LATE_SHARE)
 
 
 def _stacked(loss: FloatArray, place: int, values: ArrayLike) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, check_array
 from rbl_gym.estimators.costs.doa_cost import DoaCost, SumCost
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import (
@@ -22,22 +22,14 @@ from rbl_gym.estimators.costs.map_problem import (
 )
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
-from rbl_gym.estimators.filter import register
-from rbl_gym.estimators.iekf.augmented import AugmentedEkf
-from rbl_gym.estimators.iekf.clock import ClockEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
-from rbl_gym.estimators.iekf.robust_update import HUBER
-from rbl_gym.estimators.iekf.surveyed import SurveyedEkf
 from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, settles, spread
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locating.doa_global import global_search
+from rbl_gym.kernels.constants import HUBER
 from rbl_gym.measurements import bearing
-from rbl_gym.measurements.offsets import Clock
 from rbl_gym.measurements.ranging import NoiseLaw
-from rbl_gym.motion.kinematics import ProcessNoise
-
-MEASUREMENTS = ("ranges", "doa")
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,51 +198,3 @@ def _check_heard(links: ArrayLike | None, n_tags: int) -> BoolArray | None:
         raise ValueError(f"links must be True (measured) or False, got {mask[~right][0]}")
     mask = mask.astype(np.bool_)
     return None if mask.all() else mask
-
-
-def iterated_ekf(
-    tags: FloatArray,
-    noise: Any,
-    process: ProcessNoise,
-    iterations: int = 4,
-    robust: bool | str = False,
-    measurement: str = "ranges",
-    range_noise: NoiseLaw | None = None,
-    offset: str | None = None,
-    clock: Clock | None = None,
-    anchor_std_m: ArrayLike | None = None,
-) -> IteratedEkf | AugmentedEkf | ClockEkf:
-    """Return the filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
-
-    Parameters
-    ----------
-    measurement
-        ``"ranges"`` or ``"doa"``; `noise` is their law.
-    range_noise
-        For ``"doa"``: the law of additional ranges of an update.
-    tags, process, iterations, robust, offset
-        As in `IteratedEkf`.
-    clock
-        Law of lasting offsets, instead of `offset`: their clocks become states (`ClockEkf`).
-    anchor_std_m
-        Standard deviation of the anchor positions: they become states (`SurveyedEkf`).
-    """
-    check_one_of("measurement", measurement, MEASUREMENTS)
-    if measurement == "doa":
-        for name, told in (("offset", offset), ("clock", clock), ("anchor_std_m", anchor_std_m)):
-            if told is not None:
-                raise ValueError(f"{name} must be None with angles, got {told!r:.80}")
-        return DoaEkf(tags, noise, process, iterations, robust, range_noise=range_noise)
-    if range_noise is not None:
-        raise ValueError(
-            "range_noise must be None with measurement='ranges', as noise is the law of the ranges"
-        )
-    filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
-    if anchor_std_m is None:
-        return filter if clock is None else ClockEkf(filter, clock=clock)
-    if clock is not None:
-        raise ValueError(f"clock must be None with anchor_std_m, got {clock!r:.80}")
-    return SurveyedEkf(filter, anchor_std_m=anchor_std_m)
-
-
-register("iekf", iterated_ekf)

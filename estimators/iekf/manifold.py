@@ -28,7 +28,7 @@ from rbl_gym.estimators.costs.map_problem import PoseState, map_problem
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, predict_pose, update_pose
-from rbl_gym.estimators.iekf.robust_update import HUBER, check_robust
+from rbl_gym.estimators.iekf.robust_update import check_robust
 from rbl_gym.estimators.iekf.vague_start import (
     VAGUE_ROTATION_VARIANCE,
     global_start,
@@ -45,6 +45,7 @@ from rbl_gym.estimators.inputs import (
     links_of_plain_epoch,
     plain,
 )
+from rbl_gym.kernels.constants import HUBER
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw

@@ -13,10 +13,11 @@ from rbl_gym.estimators.costs.losses import SQUARES, cut_huber
 from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
-from rbl_gym.estimators.iekf.robust_update import GATE, HUBER, late_solution, robust_solution
+from rbl_gym.estimators.iekf.robust_update import late_solution, robust_solution
 from rbl_gym.estimators.inputs import plain
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.kernels.constants import GATE, HUBER
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.noise_laws import law_of
 

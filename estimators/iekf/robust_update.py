@@ -18,17 +18,10 @@ from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution
 from rbl_gym.estimators.costs.losses import LATE, cut_huber, huber
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
 from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
+from rbl_gym.kernels.constants import CUTOFFS, GATE, HUBER, LARGEST_SHARE_OUT
 
-# Whitened residual at which Huber's loss changes from squares to absolute values.
-HUBER = 1.5
-# Number of standard deviations beyond which a link contradicts a pose.
-GATE = 4.0
-# Used if the gate at the prior was wrong. The first one is wide, because Huber's pose is biased.
-_CUTOFFS = (6.0, GATE)
 # Codes of `robust` for the kernel.
 ROBUST = {False: 0, True: 1, "late": 2}
-# If more than this share of the links contradict a pose, the pose is in doubt and all links count.
-_LARGEST_SHARE_OUT = 0.5
 
 
 def robust_solution(
@@ -38,7 +31,7 @@ def robust_solution(
 
     Links whose innovation no consistent prior explains are excluded at the start. If the resulting
     pose disagrees, for links in or out, they are selected again from a solution with Huber's loss,
-    successively at `_CUTOFFS`. Each stage has so many Gauss-Newton iterations; the problem's own
+    successively at `CUTOFFS`. Each stage has so many Gauss-Newton iterations; the problem's own
     loss is ignored.
     """
     data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
@@ -51,7 +44,7 @@ def robust_solution(
     if not wrong.any():
         return first
     found = minimize_pose(_with(problem, data), rotation, translation, iterations, 1e-2)
-    for cutoff in _CUTOFFS:
+    for cutoff in CUTOFFS:
         squared = squared_residuals(data, found.rotation, found.translation)
         doubted = _contradicted(squared > cutoff**2, data.weights)
         loss = cut_huber(HUBER, np.where(doubted, np.inf, cutoff))
@@ -111,6 +104,6 @@ def _beyond_gate(prior: PoseState, data: RangeCost) -> BoolArray:
 
 
 def _contradicted(out: BoolArray, weights: FloatArray) -> BoolArray:
-    """Return whether (...) more than `_LARGEST_SHARE_OUT` of the links are out."""
+    """Return whether (...) more than `LARGEST_SHARE_OUT` of the links are out."""
     links = (weights > 0).sum(axis=(-2, -1))
-    return np.asarray(out.sum(axis=(-2, -1)) > _LARGEST_SHARE_OUT * links)
+    return np.asarray(out.sum(axis=(-2, -1)) > LARGEST_SHARE_OUT * links)

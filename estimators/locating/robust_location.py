@@ -23,8 +23,8 @@ from rbl_gym.estimators.locating.maximum_likelihood import (
     merge,
 )
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
+from rbl_gym.kernels.constants import HUBER
 
-_HUBER = 1.5
 # Final scale of the Geman-McClure loss, in standard deviations.
 _NARROWEST = 3.0
 # A robust fit with a smaller fraction of inliers is searched for again.
@@ -42,7 +42,7 @@ def robust(
     left out of the maximum-likelihood refit.
     """
     rotation, translation = _stand_ins(rotation, translation, cost.anchors)
-    easy = dataclasses.replace(cost, loss=huber(_HUBER))
+    easy = dataclasses.replace(cost, loss=huber(HUBER))
     solution = minimize(easy, rotation, translation, iterations=20, tolerance=1e-2)
     solution = _narrow(easy, solution.rotation, solution.translation, widest=1.0)
     links = np.maximum((cost.weights > 0).sum(axis=(-2, -1)), 1)

@@ -44,6 +44,7 @@ from rbl_gym.estimators.smoothing.ranges import (
     bias_of,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels.constants import HUBER
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.measurements.link_bias import LinkBias
@@ -52,8 +53,6 @@ from rbl_gym.measurements.offsets import Clock
 
 __all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
 
-# Threshold (whitened residual) of the Huber loss that starts the search for non-convex losses.
-_HUBER = 1.5
 # Iteration stops if the predicted decrease of the cost per epoch is below this.
 _TOLERANCE, _COARSE = 1e-6, 1e-3
 # Damping: information (1/rad^2, 1/m^2) added to a pose if a step goes too far, small and large.
@@ -214,7 +213,7 @@ def smooth(
     """
     iterations = check_count("iterations", iterations)
     problem, state = _checked(log, model, prior, start)
-    losses = [model.loss] if _is_convex(model.loss) else [huber(_HUBER), model.loss]
+    losses = [model.loss] if _is_convex(model.loss) else [huber(HUBER), model.loss]
     for loss in losses:
         tolerance = _TOLERANCE if loss is losses[-1] else _COARSE
         state, equations, converged = problem.minimize(state, loss, iterations, tolerance)

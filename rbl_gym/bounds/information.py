@@ -191,7 +191,7 @@ def information_at(
     if anchor_std is not None:
         told = _anchor_information(*told, anchor_std)
     elif offset is None:
-        told = link_information(*told)
+        told = add_range_information(*told)
     else:
         told = _offset_information(*told, offsets.code_of(offset))
     if not np.isfinite(told).all():
@@ -200,7 +200,7 @@ def information_at(
 
 
 @compiled("pose_bound:range_information")
-def link_information(
+def add_range_information(
     prior: FloatArray,
     anchors: FloatArray,
     tags: FloatArray,
@@ -209,7 +209,7 @@ def link_information(
     law: FloatArray,
     share: FloatArray,
 ) -> FloatArray:
-    """Return prior information (..., 6, 6) plus that of ranges with a law given by its numbers."""
+    """Return prior information (..., 6, 6) plus that of all ranges, with a law by its numbers."""
     noise = ranging.law_of(law)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share)
 
@@ -225,7 +225,7 @@ def _offset_information(
     share: FloatArray,
     offset: int,
 ) -> FloatArray:
-    """Compute `link_information` of ranges with unknown offsets, by the code of their kind."""
+    """Compute `add_range_information` of ranges with unknown offsets, by the code of their kind."""
     noise, kind = ranging.law_of(law), offsets.name_of(offset)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share, kind)
 
@@ -241,7 +241,7 @@ def _anchor_information(
     share: FloatArray,
     anchor_std: FloatArray,
 ) -> FloatArray:
-    """Compute `link_information` for anchor positions with standard deviations (M, 3)."""
+    """Compute `add_range_information` for anchor positions with standard deviations (M, 3)."""
     noise = ranging.law_of(law)
     return prior + _surveyed_information(
         anchors, tags, rotation, translation, noise, share, anchor_std

@@ -245,19 +245,19 @@ def _faces(low: FloatArray, high: FloatArray) -> tuple[np.ndarray, FloatArray]:
     return np.array([0, 0, 1, 1, 2]), np.stack(values, axis=-1)
 
 
-@compiled("walls:project_to_box")
+@compiled("room_walls:project_to_box")
 def _project_to_box(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Compute `Box.project` in boxes between two corners (..., 3)."""
     return np.minimum(np.maximum(points, low), high)
 
 
-@compiled("walls:place_in_box")
+@compiled("room_walls:place_in_box")
 def _place_in_box(action: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
     """Compute `Box.place`; centres and half sizes (..., 3)."""
     return middle + _cut(action) * half
 
 
-@compiled("walls:project")
+@compiled("room_walls:project")
 def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Compute `Walls.project` in rooms between two corners (..., 3)."""
     axes, values = _faces(low, high)
@@ -270,7 +270,7 @@ def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> 
     return np.where(axes[face] == np.arange(3), chosen, inside)
 
 
-@compiled("walls:place")
+@compiled("room_walls:place")
 def place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Compute `Walls.place` in rooms between two corners (..., 3)."""
     action = _cut(action)

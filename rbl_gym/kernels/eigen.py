@@ -1,4 +1,4 @@
-"""Eigenvectors of small symmetric matrices by Jacobi rotations, and their applications."""
+"""Eigenvectors of small symmetric matrices by Jacobi rotations."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 from rbl_gym.kernels.jit import helper
-from rbl_gym.kernels.workspace import workspace
 
 _SWEEPS = 30
 
@@ -48,32 +47,3 @@ def eigen(A: Any, V: Any) -> None:
                     A[p, k], A[q, k] = cosine * x - sine * y, sine * x + cosine * y
                     x, y = V[k, p], V[k, q]
                     V[k, p], V[k, q] = cosine * x - sine * y, sine * x + cosine * y
-
-
-@helper
-def nearest_rotation(M: Any, Q: Any) -> None:
-    """Return the proper rotation Q nearest to M (3, 3): largest eigenvector of Horn's matrix."""
-    K, V = workspace((4, 4)), workspace((4, 4))
-    K[0, 0] = M[0, 0] + M[1, 1] + M[2, 2]
-    K[1, 1] = M[0, 0] - M[1, 1] - M[2, 2]
-    K[2, 2] = -M[0, 0] + M[1, 1] - M[2, 2]
-    K[3, 3] = -M[0, 0] - M[1, 1] + M[2, 2]
-    K[0, 1] = K[1, 0] = M[2, 1] - M[1, 2]
-    K[0, 2] = K[2, 0] = M[0, 2] - M[2, 0]
-    K[0, 3] = K[3, 0] = M[1, 0] - M[0, 1]
-    K[1, 2] = K[2, 1] = M[1, 0] + M[0, 1]
-    K[1, 3] = K[3, 1] = M[0, 2] + M[2, 0]
-    K[2, 3] = K[3, 2] = M[2, 1] + M[1, 2]
-    eigen(K, V)
-    best = 0
-    for i in range(1, 4):
-        if K[i, i] > K[best, best]:
-            best = i
-    w, x, y, z = V[0, best], V[1, best], V[2, best], V[3, best]
-    scale = 2 / (w * w + x * x + y * y + z * z)
-    Q[0, 0] = 1 - scale * (y * y + z * z)
-    Q[1, 1] = 1 - scale * (x * x + z * z)
-    Q[2, 2] = 1 - scale * (x * x + y * y)
-    Q[0, 1], Q[1, 0] = scale * (x * y - w * z), scale * (x * y + w * z)
-    Q[0, 2], Q[2, 0] = scale * (x * z + w * y), scale * (x * z - w * y)
-    Q[1, 2], Q[2, 1] = scale * (y * z - w * x), scale * (y * z + w * x)

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.kernels.eigen import eigen, nearest_rotation
+from rbl_gym.kernels.eigen import eigen
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, of_size
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, solve
 from rbl_gym.kernels.range_cost import set_huber
+from rbl_gym.kernels.rotation_fits import nearest_rotation
 from rbl_gym.kernels.workspace import workspace, zeros
 
 _cholesky3, _solve3, _invert3 = of_size(3)

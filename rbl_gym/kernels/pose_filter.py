@@ -11,6 +11,18 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.kernels import rotations
+from rbl_gym.kernels.constants import (
+    CUTOFF,
+    CUTOFFS,
+    GATE,
+    HUBER,
+    LARGEST_SHARE_OUT,
+    LATE_HUBER,
+    LATE_SHARE,
+    OF_LATE,
+    POWER,
+    THRESHOLD,
+)
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
 from rbl_gym.kernels.offsets import squared_residuals_of
@@ -22,19 +34,8 @@ from rbl_gym.kernels.workspace import workspace, zeros
 HUGE = 1e50
 # The largest weight: compilers make slow code of a comparison with infinity.
 LARGEST = 1e300
-# Whitened residual at which Huber's loss changes from squares to absolute values.
-HUBER = 1.5
-# Number of standard deviations beyond which a link contradicts a pose.
-GATE = 4.0
 # Values of `robust`: squares, Huber's loss with a gate, the loss for late ranges.
 SQUARES, GATED, LATE = 0, 1, 2
-# Whitened residual above which a possibly late range is weighted less, and the remaining fraction
-# of its weight if it is late.
-LATE_HUBER, LATE_SHARE = 1.0, 0.5
-# After a wrong gate at the prior: first a wide one, as the pose of Huber's loss is biased.
-CUTOFFS = (6.0, GATE)
-# If more than this fraction of the links contradicts a pose, the pose is doubtful: use all links.
-LARGEST_SHARE_OUT = 0.5
 # Tags this thin relative to their length (squared) count as collinear.
 THIN = 0.01
 
@@ -122,8 +123,8 @@ def count_beyond(squared: Any, cutoff: float) -> int:
 
 
 @helper
-def leave_out(P0: Any, squared: Any, tags: Any, width: float, kept: Any) -> int:
-    """Set weights of links that contradict the prior to zero, unless too many; return how many.
+def leave_out(P0: Any, squared: Any, tags: Any, width: float, kept: Any) -> None:
+    """Set weights of links that contradict the prior to zero, unless there are too many.
 
     `squared` and the weights `kept` are those at the prior. The variance of an innovation is at
     most that of the range plus the square of `width` times ``sqrt(tr P_v) + |c| sqrt(tr P_w)``.
@@ -145,8 +146,7 @@ def leave_out(P0: Any, squared: Any, tags: Any, width: float, kept: Any) -> int:
                     out += beyond
                     links += weight > 0
         if out == 0 or out > LARGEST_SHARE_OUT * links:
-            return 0
-    return out
+            return
 
 
 @helper
@@ -294,7 +294,7 @@ def update(
         cost[0] = math.nan
         return
     if robust != SQUARES:
-        loss[0] = HUBER
+        loss[THRESHOLD] = HUBER
     if robust == LATE:
         tolerance = 1e-2
     if robust == GATED:
@@ -308,7 +308,12 @@ def update(
         leave_out(P0, squared, tags, 1.0 if offset == 0 else 2.0, kept)
     for stage in range(4):
         if stage == 1 and robust == LATE:
-            loss[0], loss[3], loss[4], tolerance = LATE_HUBER, 2.0, LATE_SHARE, 1e-6
+            loss[THRESHOLD], loss[POWER], loss[OF_LATE], tolerance = (
+                LATE_HUBER,
+                2.0,
+                LATE_SHARE,
+                1e-6,
+            )
         elif stage == 1:
             if not is_wrong(squared, weights, kept):
                 break
@@ -317,7 +322,7 @@ def update(
             tolerance = 1e-6
             cutoff = CUTOFFS[stage - 2]
             doubted = count_beyond(squared, cutoff) > LARGEST_SHARE_OUT * links
-            loss[1] = math.inf if doubted else cutoff
+            loss[CUTOFF] = math.inf if doubted else cutoff
         if stage == 0 or (stage == 1 and robust == GATED):
             copy_pose(start_Q, start_t, Q, t)
         total, _ = solve(
@@ -328,9 +333,9 @@ def update(
             break
         if robust == LATE:
             continue
-        cutoff, loss[1] = loss[1], math.inf
+        cutoff, loss[CUTOFF] = loss[CUTOFF], math.inf
         squared_residuals_of(Q, t, ranges, weights, anchors, tags, loss, offset, squared)
-        loss[1] = cutoff
+        loss[CUTOFF] = cutoff
     mirror(H)
     keep_wide(Q0, information, Q, weights, tags, H)
     if not invert(H, L, P):
@@ -344,7 +349,7 @@ def update(
             for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
                 if kept[m, n] > 0:
                     of_prior -= loss_of(squared[m, n], False, loss)[0]
-        loss[1] = GATE
+        loss[CUTOFF] = GATE
         if offset != 0:
             squared_residuals_of(Q, t, ranges, weights, anchors, tags, loss, offset, squared)
         total = of_prior + data_cost(squared, loss)

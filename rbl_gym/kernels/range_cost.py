@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from rbl_gym.kernels.constants import CUTOFF, OF_LATE, POWER, SCALE, THRESHOLD
 from rbl_gym.kernels.jit import helper, inlined
 
 
@@ -20,7 +21,7 @@ def loss_of(squared: float, late: bool, loss: Any) -> tuple[float, float]:
     and McClure if the scale is finite, or the redescending one if the power is 2. A late range,
     which is longer than expected, has its own fraction of all that.
     """
-    threshold, cutoff, scale = loss[0], loss[1], loss[2]
+    threshold, cutoff, scale = loss[THRESHOLD], loss[CUTOFF], loss[SCALE]
     if scale < math.inf:
         square = scale * scale
         share = square / (squared + square)
@@ -32,28 +33,28 @@ def loss_of(squared: float, late: bool, loss: Any) -> tuple[float, float]:
     if squared > threshold * threshold:
         share = threshold / math.sqrt(squared)
     cost = share * squared * (1 - 0.5 * share)
-    if loss[3] == 2.0:
+    if loss[POWER] == 2.0:
         if share < 1:
             cost = threshold * threshold * (0.5 - math.log(share))
         share *= share
         if late:
-            cost *= loss[4]
-            share *= loss[4]
+            cost *= loss[OF_LATE]
+            share *= loss[OF_LATE]
     return cost, share if inside else 0.0
 
 
 @inlined
 def set_huber(loss: Any, threshold: float) -> None:
     """Write Huber's loss to `loss`; half the square if the threshold is infinite."""
-    loss[0] = threshold
-    loss[1] = loss[2] = math.inf
-    loss[3] = loss[4] = 1.0
+    loss[THRESHOLD] = threshold
+    loss[CUTOFF] = loss[SCALE] = math.inf
+    loss[POWER] = loss[OF_LATE] = 1.0
 
 
 @inlined
 def is_plain(loss: Any) -> bool:
     """Return whether a loss is half the square."""
-    return loss[0] == math.inf and loss[1] == math.inf and loss[2] == math.inf
+    return loss[THRESHOLD] == math.inf and loss[CUTOFF] == math.inf and loss[SCALE] == math.inf
 
 
 @inlined

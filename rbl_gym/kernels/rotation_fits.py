@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 from rbl_gym.kernels import rotations
+from rbl_gym.kernels.eigen import eigen
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.workspace import workspace
 
@@ -103,8 +104,7 @@ def _polar(Q: Any) -> None:
 def _nearest_by_quaternion(Q: Any) -> None:
     """Compute the nearest rotation of any matrix, also reflected or singular, in place.
 
-    Its quaternion is the eigenvector of the largest eigenvalue of Horn's 4 x 4 matrix, computed by
-    Jacobi rotations.
+    Its quaternion is the eigenvector of the largest eigenvalue of Horn's 4 x 4 matrix.
     """
     work = workspace((2, 4, 4))
     K, V = work[0], work[1]
@@ -113,19 +113,9 @@ def _nearest_by_quaternion(Q: Any) -> None:
     K[0, 1], K[0, 2], K[0, 3] = Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1]
     K[1, 2], K[1, 3], K[2, 3] = Q[0, 1] + Q[1, 0], Q[0, 2] + Q[2, 0], Q[1, 2] + Q[2, 1]
     for i in range(4):
-        for j in range(4):
-            V[i, j] = 1.0 if i == j else 0.0
-            if j < i:
-                K[i, j] = K[j, i]
-    for _ in range(20):
-        off = 0.0
-        for p in range(3):
-            for q in range(p + 1, 4):
-                off = max(off, abs(K[p, q]))
-                if K[p, q] != 0:
-                    _jacobi_rotation(K, V, p, q)
-        if off < 1e-15:
-            break
+        for j in range(i):
+            K[i, j] = K[j, i]
+    eigen(K, V)
     best = 0
     for i in range(1, 4):
         if K[i, i] > K[best, best]:
@@ -134,26 +124,6 @@ def _nearest_by_quaternion(Q: Any) -> None:
     Q[0, 0], Q[0, 1], Q[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     Q[1, 0], Q[1, 1], Q[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     Q[2, 0], Q[2, 1], Q[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-
-
-@helper
-def _jacobi_rotation(K: Any, V: Any, p: int, q: int) -> None:
-    """Rotate rows and columns p, q of K so that ``K[p, q]`` is zero, and the columns of V."""
-    theta = 0.5 * (K[q, q] - K[p, p]) / K[p, q]
-    t = 1 / (abs(theta) + math.sqrt(theta * theta + 1))
-    if theta < 0:
-        t = -t
-    c = 1 / math.sqrt(t * t + 1)
-    s = t * c
-    for i in range(K.shape[0]):
-        a, b = K[i, p], K[i, q]
-        K[i, p], K[i, q] = c * a - s * b, s * a + c * b
-    for i in range(K.shape[0]):
-        a, b = K[p, i], K[q, i]
-        K[p, i], K[q, i] = c * a - s * b, s * a + c * b
-        a, b = V[i, p], V[i, q]
-        V[i, p], V[i, q] = c * a - s * b, s * a + c * b
-    K[p, q] = K[q, p] = 0.0
 
 
 @gufunc("(p,p),(p),(d,d)->(d,d),()")
