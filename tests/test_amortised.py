@@ -22,8 +22,8 @@ from rbl_gym.placement import (
     dilution,
     exchange,
     layouts,
+    network_input,
     scene_files,
-    scenery,
     search,
     setting,
 )
@@ -52,7 +52,7 @@ def office(n_anchors=8):
 
 def room_tokens(batch=(2,)):
     task, contexts = problem("uwb_room", 5, 2, batch)
-    return tokens_of(scenery.of_task(task, contexts), 5)
+    return tokens_of(network_input.of_task(task, contexts), 5)
 
 
 def scaled_task(task, by):
@@ -155,13 +155,13 @@ def test_padding_changes_nothing():
 
 def test_padded_zones_and_obstacles_are_padded_tokens():
     task, contexts = problem("uwb_room", 5, 2, (2,))
-    seen = scenery.of_task(task, contexts)
-    padded = seen._replace(
-        zones=np.pad(seen.zones, ((0, 0), (0, 1), (0, 0))),
-        obstacles=np.pad(seen.obstacles, ((0, 0), (0, 1), (0, 0))),
+    scenery = network_input.of_task(task, contexts)
+    padded = scenery._replace(
+        zones=np.pad(scenery.zones, ((0, 0), (0, 1), (0, 0))),
+        obstacles=np.pad(scenery.obstacles, ((0, 0), (0, 1), (0, 0))),
     )
     assert isinstance(padded, Scenery)
-    for rows, more in zip(tokens_of(seen, 5), tokens_of(padded, 5), strict=True):
+    for rows, more in zip(tokens_of(scenery, 5), tokens_of(padded, 5), strict=True):
         np.testing.assert_allclose(more[:, : rows.shape[1]], rows)
         assert not more[:, rows.shape[1] :].any()
 
@@ -179,17 +179,17 @@ def test_worlds_do_not_see_each_other():
 def room_state(n_anchors=6, batch=(2,)):
     """A room with two racks, layouts at random candidates, and their state."""
     task, contexts = problem("uwb_room", n_anchors, 2, batch, seed=8)
-    seen = scenery.of_task(task, contexts, for_swaps=True)
-    bound = exchange.bound_of(setting.of_task(task, contexts), seen.candidates)
+    scenery = network_input.of_task(task, contexts, for_swaps=True)
+    bound = exchange.bound_of(setting.of_task(task, contexts), scenery.candidates)
     rng = np.random.default_rng(1)
-    number = seen.candidates.shape[-2]
+    number = scenery.candidates.shape[-2]
     index = np.stack([rng.permutation(number)[:n_anchors] for _ in range(*batch)])
-    points = np.take_along_axis(seen.candidates, index[..., None], axis=-2)
+    points = np.take_along_axis(scenery.candidates, index[..., None], axis=-2)
 
     def judged(layouts):
         return exchange.evaluated(bound, layouts)
 
-    return task, contexts, seen.candidates, judged, judged(points)
+    return task, contexts, scenery.candidates, judged, judged(points)
 
 
 def test_the_score_of_a_state_is_the_score():
@@ -253,16 +253,16 @@ def test_no_more_evaluations_than_asked(monkeypatch, scene, racks, evaluations):
 # --- the dilution of precision -----------------------------------------------------------------
 
 
-def dilution_of(seen, weight, points, share):
+def dilution_of(scenery, weight, points, share):
     """Textbook: mean squared error of a point's position, its ranges from all anchors."""
     total = 0.0
-    for p, place in enumerate(seen.places):
-        information = (2 / seen.extent) ** 2 * np.eye(3)
+    for p, place in enumerate(scenery.places):
+        information = (2 / scenery.extent) ** 2 * np.eye(3)
         for m, point in enumerate(points):
             gap = place - point
             r = np.linalg.norm(gap)
-            sigma = np.hypot(seen.noise[0], seen.noise[1] * r)
-            information += share[p, m] * len(seen.tags) / sigma**2 * np.outer(gap, gap) / r**2
+            sigma = np.hypot(scenery.noise[0], scenery.noise[1] * r)
+            information += share[p, m] * len(scenery.tags) / sigma**2 * np.outer(gap, gap) / r**2
         total += weight[p] * np.trace(np.linalg.inv(information))
     return total
 
@@ -270,29 +270,29 @@ def dilution_of(seen, weight, points, share):
 def room_links(n_anchors, seed):
     """A room with two racks as the exchange sees it, and its parts."""
     task, contexts = problem("uwb_room", n_anchors, 2, seed=seed)
-    seen, obstacles = scenery.of_task(task, contexts), task.obstacles_in(contexts)
+    scenery, obstacles = network_input.of_task(task, contexts), task.obstacles_in(contexts)
     rng = np.random.default_rng(seed)
     points = task.scene.anchor_region.draw(rng.random((n_anchors, 3)))
-    everything = points, seen.fixed, seen.candidates
-    links = (dilution.links_of(seen, x, obstacles.share(x, seen.places)) for x in everything)
+    everything = points, scenery.fixed, scenery.candidates
+    links = (dilution.links_of(scenery, x, obstacles.share(x, scenery.places)) for x in everything)
     weight = np.full(task.n_poses, 1 / task.n_poses)
 
     def judged(points):
-        return dilution_of(seen, weight, points, obstacles.share(points, seen.places))
+        return dilution_of(scenery, weight, points, obstacles.share(points, scenery.places))
 
-    return points, seen, judged, (weight, (2 / seen.extent) ** 2, dilution.Parts(*links))
+    return points, scenery, judged, (weight, (2 / scenery.extent) ** 2, dilution.Parts(*links))
 
 
 def test_an_exchange_is_the_best_of_all():
     """Brute force over all pairs; anchors of which one can be spared are tried only."""
-    points, seen, judged, arguments = room_links(3, 4)
-    allowed = np.ones(len(seen.candidates), dtype=np.bool_)
+    points, scenery, judged, arguments = room_links(3, 4)
+    allowed = np.ones(len(scenery.candidates), dtype=np.bool_)
     found = dilution.exchanged(*arguments, allowed, 1)
     assert (found != points).any(axis=-1).sum() == 1
     tried = [
         judged(np.where(np.arange(3)[:, None] == m, candidate, points))
         for m in range(3)
-        for candidate in seen.candidates
+        for candidate in scenery.candidates
     ]
     assert judged(found) == pytest.approx(min(tried), rel=1e-4)
     assert judged(found) < judged(points)
@@ -300,32 +300,32 @@ def test_an_exchange_is_the_best_of_all():
 
 def test_the_slope_of_the_dilution_is_that_of_finite_differences():
     task, contexts = problem("drone_yard", 4, seed=2)
-    seen = scenery.of_task(task, contexts)
+    scenery = network_input.of_task(task, contexts)
     rng = np.random.default_rng(2)
     points = task.scene.anchor_region.draw(rng.random((4, 3)))
     weight, share = np.full(task.n_poses, 1 / task.n_poses), np.ones((task.n_poses, 4))
-    fixed = dilution.links_of(seen, points[:0], share[:, :0])
-    links = dilution.links_of(seen, points, share)
-    square, slope = dilution.square_and_slope(seen, weight, links, fixed, share)
-    assert square == pytest.approx(dilution_of(seen, weight, points, share), rel=1e-9)
+    fixed = dilution.links_of(scenery, points[:0], share[:, :0])
+    links = dilution.links_of(scenery, points, share)
+    square, slope = dilution.square_and_slope(scenery, weight, links, fixed, share)
+    assert square == pytest.approx(dilution_of(scenery, weight, points, share), rel=1e-9)
     for index in np.ndindex(4, 3):
         moved = [points.copy(), points.copy()]
         moved[0][index] += 1e-3
         moved[1][index] -= 1e-3
-        high, low = (dilution_of(seen, weight, x, share) for x in moved)
+        high, low = (dilution_of(scenery, weight, x, share) for x in moved)
         assert slope[index] == pytest.approx(
             (high - low) / 2e-3, rel=1e-4, abs=1e-6 * float(square)
         )
 
 
 def test_exchanges_keep_to_what_is_allowed_and_stop():
-    points, seen, judged, arguments = room_links(5, 7)
-    allowed = np.arange(len(seen.candidates)) % 2 == 0
+    points, scenery, judged, arguments = room_links(5, 7)
+    allowed = np.arange(len(scenery.candidates)) % 2 == 0
     found = dilution.exchanged(*arguments, allowed, 50)
     moved = found[(found != points).any(axis=-1)]
     assert len(moved)
     assert len(np.unique(found, axis=0)) == 5
-    assert all((seen.candidates[allowed] == point).all(axis=-1).any() for point in moved)
+    assert all((scenery.candidates[allowed] == point).all(axis=-1).any() for point in moved)
     assert judged(found) < judged(points)
     none = dilution.exchanged(*arguments, np.zeros_like(allowed), 50)
     np.testing.assert_array_equal(none, points)
@@ -443,41 +443,41 @@ def test_the_loss_of_the_training_is_the_score(family):
     from rbl_gym.studies.learning.placement_families import draw
 
     batch = draw(family, np.random.default_rng(3), 4)
-    seen, case = batch.seen, case_of(batch)
-    origin, unit = seen.frame()
+    scenery, case = batch.scenery, case_of(batch)
+    origin, unit = scenery.frame()
     rng = np.random.default_rng(0)
     steps = torch.as_tensor(rng.standard_normal((4, batch.count, 3)), dtype=torch.float32)
-    anchors = torch_layouts.legal(KINDS[seen.kind], case, steps)
+    anchors = torch_layouts.legal(KINDS[scenery.kind], case, steps)
     sight = torch_layouts.sight(case, anchors, 1e-5)
     found = torch_layouts.log_score(case, torch_layouts.information(case, anchors, sight))
     found = found.numpy() + np.log(unit)
     places = origin[:, None] + unit[:, None, None] * anchors.numpy().astype(float)
     for index in range(4):
-        low, high = (tuple(corner[index]) for corner in (seen.low, seen.high))
+        low, high = (tuple(corner[index]) for corner in (scenery.low, scenery.high))
         if family == "shells":
-            region = Shell(float(seen.inner[index]), float(batch.outer[index]))
+            region = Shell(float(scenery.inner[index]), float(batch.outer[index]))
         else:
             region = Box(low, high) if family == "boxes" else Walls(low, high)
         assert np.abs(region.project(places[index]) - places[index]).max() < 1e-4 * unit[index]
         told = sample_of(batch, index)
-        layout = np.concatenate([seen.fixed[index], places[index]])
-        share = placement_share(seen, index, layout, batch.left[index])
+        layout = np.concatenate([scenery.fixed[index], places[index]])
+        share = placement_share(scenery, index, layout, batch.left[index])
         score, _ = placement.score_and_gradient(
-            layout, told, seen.tags[index], RangeNoise(*seen.noise[index]), share
+            layout, told, scenery.tags[index], RangeNoise(*scenery.noise[index]), share
         )
         assert found[index] == pytest.approx(np.log(score), abs=2e-3)
 
 
 def sample_of(batch, index):
-    fields = (batch.rotation, batch.seen.places, batch.weight, batch.prior)
+    fields = (batch.rotation, batch.scenery.places, batch.weight, batch.prior)
     rotation, places, weight, prior = (field[index] for field in fields)
     return placement.Sample(rotation, places, weight, prior, np.zeros(len(weight), dtype=int))
 
 
-def placement_share(seen, index, layout, left):
+def placement_share(scenery, index, layout, left):
     from rbl_gym.geometry.obstacles import Obstacles
 
-    return Obstacles(seen.obstacles[index, :, :6], left).share(layout, seen.places[index])
+    return Obstacles(scenery.obstacles[index, :, :6], left).share(layout, scenery.places[index])
 
 
 @needs("torch")

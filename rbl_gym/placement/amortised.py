@@ -20,13 +20,13 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray, check_count
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
-from rbl_gym.placement import dilution, exchange, scenery, setting
+from rbl_gym.placement import dilution, exchange, network_input, setting
 from rbl_gym.placement.attention import MOST, chosen, forward
 from rbl_gym.placement.building import Problem, cube
 from rbl_gym.placement.descent import follow
 from rbl_gym.placement.problem import Context, PlacementTask, link_shares
 from rbl_gym.placement.sample import sample
-from rbl_gym.placement.tokens import KINDS, Scenery, shown_of, tokens_of, turned, turned_points
+from rbl_gym.placement.tokens import KINDS, Scenery, mirrored, mirrored_points, shown_of, tokens_of
 
 __all__ = ["Network", "load", "of_problem", "of_task", "read"]
 
@@ -67,11 +67,11 @@ def read(path: Any) -> Network:
 class _Play(NamedTuple):
     """A problem with all that the network needs.
 
-    `judge` is the score at the places of `seen`, `held` the obstacles in which no anchor may be,
+    `judge` is the score at the places of `scenery`, `held` the obstacles in which no anchor may be,
     `open` whether nothing is in the way, `count` the number of anchors to place.
     """
 
-    seen: Scenery
+    scenery: Scenery
     judge: setting.Setting
     held: Obstacles
     open: bool
@@ -79,7 +79,7 @@ class _Play(NamedTuple):
 
     def share(self, points: FloatArray) -> FloatArray:
         """Return the information fractions (..., P, M) of the links of anchors (..., M, 3)."""
-        return link_shares(self.judge.scene, self.judge.obstacles, points, self.seen.places)
+        return link_shares(self.judge.scene, self.judge.obstacles, points, self.scenery.places)
 
     def legal(self, points: FloatArray) -> FloatArray:
         """Return legal positions (..., M, 3) for points of any kind."""
@@ -91,32 +91,32 @@ def _placed(network: Network, play: _Play, image: int = 0) -> FloatArray:
 
     The dilution of precision improves it: in the open by steps, among candidates by exchanges.
     """
-    seen = turned(play.seen, image) if image else play.seen
-    total = play.count + seen.fixed.shape[-2]
-    steps, scores = forward(network.weights, tokens_of(seen, play.count), play.count, total)
-    if KINDS[seen.kind] == "mounts":
+    scenery = mirrored(play.scenery, image) if image else play.scenery
+    total = play.count + scenery.fixed.shape[-2]
+    steps, scores = forward(network.weights, tokens_of(scenery, play.count), play.count, total)
+    if KINDS[scenery.kind] == "mounts":
         index = chosen(scores)[..., None]
-        points = np.take_along_axis(play.seen.candidates, index, axis=-2)
+        points = np.take_along_axis(play.scenery.candidates, index, axis=-2)
     else:
-        _, unit = seen.frame()
-        points = seen.aim()[..., None, :] + unit[..., None, None] * steps
-        points = play.legal(turned_points(points, image, back=True))
-    if seen.candidates.shape[-2]:
+        _, unit = scenery.frame()
+        points = scenery.aim()[..., None, :] + unit[..., None, None] * steps
+        points = play.legal(mirrored_points(points, image, back=True))
+    if scenery.candidates.shape[-2]:
         return _exchanged(play, points)
     return _stepped(play, points) if play.open else points
 
 
 def _stepped(play: _Play, points: FloatArray) -> FloatArray:
     """Return anchors (..., M, 3) after steps along the gradient, without the score."""
-    seen, batch = play.seen, points.shape[:-2]
-    fixed = dilution.links_of(seen, seen.fixed, play.share(seen.fixed))
+    scenery, batch = play.scenery, points.shape[:-2]
+    fixed = dilution.links_of(scenery, scenery.fixed, play.share(scenery.fixed))
 
     def evaluate(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         points = points.reshape(*batch, *points.shape[1:])
         share = play.share(points)
-        links = dilution.links_of(seen, points, share)
+        links = dilution.links_of(scenery, points, share)
         square, slope = dilution.square_and_slope(
-            seen, play.judge.sample.weight, links, fixed, share
+            scenery, play.judge.sample.weight, links, fixed, share
         )
         return square.reshape(-1), slope.reshape(-1, *slope.shape[-2:])
 
@@ -126,34 +126,35 @@ def _stepped(play: _Play, points: FloatArray) -> FloatArray:
 
 def _exchanged(play: _Play, points: FloatArray) -> FloatArray:
     """Return anchors (..., M, 3) after exchanges for candidates, without the score."""
-    seen = shown_of(play.seen)
-    shares = play.share(points), play.share(seen.fixed), seen.seen
+    scenery = shown_of(play.scenery)
+    shares = play.share(points), play.share(scenery.fixed), scenery.visibility
     parts = dilution.Parts(
         *(
-            dilution.links_of(seen, x, share)
-            for x, share in zip((points, seen.fixed, seen.candidates), shares, strict=True)
+            dilution.links_of(scenery, x, share)
+            for x, share in zip((points, scenery.fixed, scenery.candidates), shares, strict=True)
         )
     )
     return dilution.exchanged(
         play.judge.sample.weight,
-        dilution.prior_of(seen),
+        dilution.prior_of(scenery),
         parts,
-        ~_illegal(play, seen.candidates),
-        _EXCHANGES[KINDS[seen.kind]],
+        ~_illegal(play, scenery.candidates),
+        _EXCHANGES[KINDS[scenery.kind]],
     )
 
 
 def _illegal(play: _Play, candidates: FloatArray) -> BoolArray:
     """Return which candidates (..., C) are not legal positions."""
-    if KINDS[play.seen.kind] == "mounts":
+    if KINDS[play.scenery.kind] == "mounts":
         return np.zeros(candidates.shape[:-1], dtype=np.bool_)
     away = np.abs(play.legal(candidates) - candidates).max(axis=-1)
-    return away > 1e-6 * play.seen.frame()[1][..., None]
+    return away > 1e-6 * play.scenery.frame()[1][..., None]
 
 
 def _swapped(network: Network, play: _Play, evaluations: int) -> tuple[FloatArray, int]:
     """Return anchors (..., M, 3) after mirror images and swaps, and the number of evaluations."""
-    candidates, bound = play.seen.candidates, exchange.bound_of(play.judge, play.seen.candidates)
+    candidates = play.scenery.candidates
+    bound = exchange.bound_of(play.judge, candidates)
     best, used = exchange.evaluated(bound, _placed(network, play)), 1
     for image in range(1, min(_IMAGES, evaluations)):
         best, _ = exchange.better(best, exchange.evaluated(bound, _placed(network, play, image)))
@@ -212,13 +213,13 @@ def _of_contexts(
 ) -> FloatArray:
     """Return the layouts (C, M, 3) of contexts."""
     judge, held = setting.of_task(task, context), task.scene.obstruction
-    seen, is_open = scenery.of_task(task, context, swap), not judge.obstacles and not held
+    scenery, is_open = network_input.of_task(task, context, swap), not judge.obstacles and not held
 
     def free(points: FloatArray) -> BoolArray:
         each = (task.obstacles_in(Context(*row)) for row in zip(*context, strict=True))
         return ~np.stack([one.contain(x) for one, x in zip(each, points, strict=True)])
 
-    play = _Play(seen, judge, held, is_open, task.n_anchors)
+    play = _Play(scenery, judge, held, is_open, task.n_anchors)
     return _improved(network, play, evaluations, swap, judge, free if judge.obstacles else None)
 
 
@@ -268,15 +269,15 @@ def of_problem(
     swap = evaluations > 1 and not smooth
     judge, later = (
         setting.of_problem(problem, sample(problem, number))
-        for number in (scenery.PLACES, _STEP_PLACES)
+        for number in (network_input.PLACES, _STEP_PLACES)
     )
-    seen = scenery.of_problem(problem, judge.sample, swap)
-    if KINDS[seen.kind] == "mounts" and len(seen.candidates) < count:
+    scenery = network_input.of_problem(problem, judge.sample, swap)
+    if KINDS[scenery.kind] == "mounts" and len(scenery.candidates) < count:
         raise ValueError(
-            f"{count} anchors cannot be mounted: obstacles leave {len(seen.candidates)} permitted "
-            "positions"
+            f"{count} anchors cannot be mounted: obstacles leave {len(scenery.candidates)} "
+            "permitted positions"
         )
-    play = _Play(seen, judge, problem.obstacles, smooth, count)
+    play = _Play(scenery, judge, problem.obstacles, smooth, count)
     found = _improved(network or load(), play, evaluations, swap, later, later.legal)
     return np.concatenate([problem.fixed, found])
 

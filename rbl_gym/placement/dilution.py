@@ -53,32 +53,34 @@ class Parts(NamedTuple):
     candidates: Links
 
 
-def links_of(seen: Scenery, points: FloatArray, share: FloatArray) -> Links:
+def links_of(scenery: Scenery, points: FloatArray, share: FloatArray) -> Links:
     """Return the links of anchors (..., M, 3) with information fractions (..., P, M)."""
-    x, y, z = (seen.places[..., :, None, k] - points[..., None, :, k] for k in range(3))
+    x, y, z = (scenery.places[..., :, None, k] - points[..., None, :, k] for k in range(3))
     square = x * x + y * y + z * z
-    weight, _ = _weight(seen, square, share)
+    weight, _ = _weight(scenery, square, share)
     wx, wy = weight * x, weight * y
     return Links(points, np.stack([wx * x, wx * y, wx * z, wy * y, wy * z, weight * z * z], -1))
 
 
-def _weight(seen: Scenery, square: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _weight(
+    scenery: Scenery, square: FloatArray, share: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return w of the information w d d' of an offset, and its derivative by the square of d."""
-    square = np.maximum(square, (_NEAR * seen.extent[..., None, None]) ** 2)
-    floor, growth = (seen.noise[..., k, None, None] ** 2 for k in (0, 1))
+    square = np.maximum(square, (_NEAR * scenery.extent[..., None, None]) ** 2)
+    floor, growth = (scenery.noise[..., k, None, None] ** 2 for k in (0, 1))
     variance = floor + growth * square
-    weight = seen.tags.shape[-2] * share / (variance * square)
+    weight = scenery.tags.shape[-2] * share / (variance * square)
     return weight, -weight * (1 / square + growth / variance)
 
 
 def square_and_slope(
-    seen: Scenery, weight: FloatArray, anchors: Links, fixed: Links, share: FloatArray
+    scenery: Scenery, weight: FloatArray, anchors: Links, fixed: Links, share: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the mean square error (...), and its derivative (..., M, 3) by the anchors.
 
     Parameters
     ----------
-    seen, weight
+    scenery, weight
         The problem, and weights (P,) of its places.
     anchors, fixed
         Links of the layout, and of fixed anchors.
@@ -86,9 +88,9 @@ def square_and_slope(
         Information fractions (..., P, M) of the links of the layout, held constant.
     """
     total = anchors.told.sum(axis=-2) + fixed.told.sum(axis=-2)
-    P = _inverse(total + prior_of(seen)[..., None, None] * _UNIT)
-    away = seen.places[..., :, None, :] - anchors.points[..., None, :, :]
-    w, slope = _weight(seen, (away**2).sum(axis=-1), share)
+    P = _inverse(total + prior_of(scenery)[..., None, None] * _UNIT)
+    away = scenery.places[..., :, None, :] - anchors.points[..., None, :, :]
+    w, slope = _weight(scenery, (away**2).sum(axis=-1), share)
     # The trace of P falls by tr(PP dF), with F the sum of w d d'.
     PPd = away @ _square(P)[..., _WHOLE]
     along = (away * PPd).sum(axis=-1)
@@ -97,9 +99,9 @@ def square_and_slope(
     return square, (weight[:, None, None] * by_place).sum(axis=-3)
 
 
-def prior_of(seen: Scenery) -> FloatArray:
+def prior_of(scenery: Scenery) -> FloatArray:
     """Return the information (...) of each coordinate without anchors."""
-    return (2 / seen.extent) ** 2
+    return (2 / scenery.extent) ** 2
 
 
 def exchanged(

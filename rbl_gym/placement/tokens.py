@@ -44,7 +44,7 @@ class Scenery(NamedTuple):
     tags
         Tags (..., N, 3) in the body frame.
     noise
-        Standard deviation of a range at the anchor, and its growth with the range (..., 2).
+        Numbers a, b (..., 2) of the noise: a range r has the variance ``a^2 + (b r)^2``.
     gain
         `Gain.numbers` (..., 4).
     extent
@@ -55,7 +55,7 @@ class Scenery(NamedTuple):
         Whether the poses fill the zones evenly; otherwise they are those of a placement task.
     places
         Positions (..., P, 3) of the body for judging candidates.
-    candidates, normals, seen
+    candidates, normals, visibility
         Legal positions (..., C, 3), their normals, and the information fractions (..., P, C) of
         their links. C may be 0.
     shown
@@ -78,7 +78,7 @@ class Scenery(NamedTuple):
     places: FloatArray
     candidates: FloatArray
     normals: FloatArray
-    seen: FloatArray
+    visibility: FloatArray
     shown: int | None = None
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
@@ -107,34 +107,34 @@ class Scenery(NamedTuple):
         return self.frame()[0].clip(self.low, self.high)
 
 
-def turned(seen: Scenery, image: int) -> Scenery:
+def mirrored(scenery: Scenery, image: int) -> Scenery:
     """Return one of the eight mirror images of a problem: x, y mirrored, and both exchanged.
 
     The body does not change, because its attitude may be any.
     """
 
     def points(x: FloatArray) -> FloatArray:
-        return turned_points(x, image)
+        return mirrored_points(x, image)
 
     def rows(x: FloatArray) -> FloatArray:
         half = np.abs(points(x[..., 3:6]))
         return np.concatenate([points(x[..., :3]), half, x[..., 6:]], axis=-1)
 
-    a, b = points(seen.low), points(seen.high)
-    return seen._replace(
+    a, b = points(scenery.low), points(scenery.high)
+    return scenery._replace(
         low=np.minimum(a, b),
         high=np.maximum(a, b),
-        zones=rows(seen.zones),
-        obstacles=rows(seen.obstacles),
-        fixed=points(seen.fixed),
-        places=points(seen.places),
-        candidates=points(seen.candidates),
-        normals=points(seen.normals),
+        zones=rows(scenery.zones),
+        obstacles=rows(scenery.obstacles),
+        fixed=points(scenery.fixed),
+        places=points(scenery.places),
+        candidates=points(scenery.candidates),
+        normals=points(scenery.normals),
     )
 
 
-def turned_points(points: FloatArray, image: int, back: bool = False) -> FloatArray:
-    """Return points (..., 3) in a mirror image of `turned`, or back from it."""
+def mirrored_points(points: FloatArray, image: int, back: bool = False) -> FloatArray:
+    """Return points (..., 3) in a mirror image of `mirrored`, or back from it."""
     signs = np.array([1.0 - 2 * (image & 1), 1.0 - (image & 2), 1.0])
     axes = [1, 0, 2] if image & 4 else [0, 1, 2]
     return points[..., axes] * signs if not back else (points * signs)[..., axes]
@@ -158,99 +158,127 @@ class Tokens(NamedTuple):
     candidates: FloatArray
 
 
-def tokens_of(seen: Scenery, count: int) -> Tokens:
+def tokens_of(scenery: Scenery, count: int) -> Tokens:
     """Return the tokens of a problem in which `count` anchors are placed."""
-    origin, unit = seen.frame()
-    at, by = origin[..., None, :], unit[..., None, None]
-    real = (seen.zones[..., 6:7] > 0).astype(float)
-    weight = seen.zones[..., 6:7] / seen.zones[..., 6:7].sum(axis=-2, keepdims=True)
-    half = seen.zones[..., 3:6] / by
-    zones = [real, place_row((seen.zones[..., :3] - at) / by), _size(half), weight]
-    solid = (seen.obstacles[..., 3:4] > 0).astype(float)
-    share = seen.obstacles[..., 6:7]
-    half = seen.obstacles[..., 3:6] / by
-    centre = (seen.obstacles[..., :3] - at) / by
-    obstacles = [solid, place_row(centre), _size(half), share, np.log10(share + 1e-3) / 3]
-    one = np.ones((*seen.fixed.shape[:-1], 1))
-    fixed = [one, place_row((seen.fixed - at) / by)]
-    seen = shown_of(seen)
-    one = np.ones((*seen.candidates.shape[:-1], 1))
-    where = place_row((seen.candidates - at) / by)
-    candidates = [one, where, seen.normals, _views(seen)]
     return Tokens(
-        _world(seen, count, origin, unit)[..., None, :],
-        _joined(*zones, seen.zones[..., 7:10]) * real,
-        _joined(*obstacles) * solid,
-        _joined(*fixed),
-        _joined(*candidates),
+        _world(scenery, count)[..., None, :],
+        _zones(scenery),
+        _obstacles(scenery),
+        _fixed(scenery),
+        _candidates(shown_of(scenery)),
     )
 
 
-def shown_of(seen: Scenery) -> Scenery:
+def shown_of(scenery: Scenery) -> Scenery:
     """Return the scenery with only those candidates of which there are tokens."""
-    if seen.shown is None:
-        return seen
-    return seen._replace(
-        candidates=seen.candidates[..., : seen.shown, :],
-        normals=seen.normals[..., : seen.shown, :],
-        seen=seen.seen[..., : seen.shown],
+    if scenery.shown is None:
+        return scenery
+    return scenery._replace(
+        candidates=scenery.candidates[..., : scenery.shown, :],
+        normals=scenery.normals[..., : scenery.shown, :],
+        visibility=scenery.visibility[..., : scenery.shown],
         shown=None,
     )
 
 
-def _world(seen: Scenery, count: int, origin: FloatArray, unit: FloatArray) -> FloatArray:
+def _zones(scenery: Scenery) -> FloatArray:
+    """Return for each zone whether it is one, its centre, size, share of the weight, attitude."""
+    zones = scenery.zones
+    weight = zones[..., 6:7]
+    real = (weight > 0).astype(float)
+    share = weight / weight.sum(axis=-2, keepdims=True)
+    place, size = _of_boxes(scenery, zones)
+    return _joined(real, place, size, share, zones[..., 7:10]) * real
+
+
+def _obstacles(scenery: Scenery) -> FloatArray:
+    """Return for each obstacle whether it is one, its centre, size, information fraction."""
+    share = scenery.obstacles[..., 6:7]
+    real = (scenery.obstacles[..., 3:4] > 0).astype(float)
+    place, size = _of_boxes(scenery, scenery.obstacles)
+    return _joined(real, place, size, share, np.log10(share + 1e-3) / 3) * real
+
+
+def _of_boxes(scenery: Scenery, boxes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return numbers (..., K, 6) of the centres, and of the sizes, of boxes (..., K, 6 or more)."""
+    _, unit = scenery.frame()
+    half = boxes[..., 3:6] / unit[..., None, None]
+    return _places(scenery, boxes[..., :3]), _size(half)
+
+
+def _places(scenery: Scenery, points: FloatArray) -> FloatArray:
+    """Return numbers (..., K, 6) of points (..., K, 3)."""
+    origin, unit = scenery.frame()
+    return place_row((points - origin[..., None, :]) / unit[..., None, None])
+
+
+def _fixed(scenery: Scenery) -> FloatArray:
+    """Return for each fixed anchor 1 and its position."""
+    place = _places(scenery, scenery.fixed)
+    return _joined(np.ones_like(place[..., :1]), place)
+
+
+def _candidates(scenery: Scenery) -> FloatArray:
+    """Return for each candidate 1, its position, normal, and views of the zones."""
+    place = _places(scenery, scenery.candidates)
+    return _joined(np.ones_like(place[..., :1]), place, scenery.normals, _views(scenery))
+
+
+def _world(scenery: Scenery, count: int) -> FloatArray:
     """Return numbers (..., G) of the region, the body and the noise."""
-    batch = origin.shape[:-1]
+    origin, unit = scenery.frame()
     by = unit[..., None]
-    kind = np.broadcast_to(np.eye(len(KINDS))[seen.kind], (*batch, len(KINDS)))
-    low, high = seen.corners()
-    tags = seen.tags / by[..., None]
+    tags = scenery.tags / by[..., None]
     second = np.einsum("...ni,...nj->...ij", tags, tags) / tags.shape[-2]
     radius = np.sqrt(np.einsum("...ii->...", second))
-    axes = np.linalg.eigvalsh(second) / (radius**2)[..., None]
-    off = np.sqrt((tags.mean(axis=-2) ** 2).sum(axis=-1)) / radius
-    floor, growth = seen.noise[..., 0] / unit, seen.noise[..., 1]
+    floor, growth = scenery.noise[..., 0] / unit, scenery.noise[..., 1]
     sigma = np.sqrt(floor**2 + growth**2)
-    limit = by[..., 0] / seen.gain[..., 0]
-    sees = np.maximum(seen.gain[..., 2], -1.0)
-    told = [
-        np.ones(batch),
-        np.full(batch, count / 16),
-        np.full(batch, 1 / count),
-        np.full(batch, seen.fixed.shape[-2] / 8),
-        np.full(batch, float(seen.even)),
-        np.log10(sigma),
-        growth**2 / sigma**2,
-        np.broadcast_to(np.log10(growth + _LEAST), batch),
-        np.log10(radius),
-        np.log10(sigma / radius),
-        off,
-        second[..., 2, 2] / radius**2,
-        np.full(batch, np.log(tags.shape[-2]) - 1.7),
-        np.log10(seen.extent / unit),
-        seen.nearest / unit,
-        np.arcsinh(seen.inner / unit),
-        limit / (1 + limit),
-        np.broadcast_to(sees, batch),
-    ]
-    region = [place_row((seen.low - origin) / by), place_row((seen.high - origin) / by)]
-    middle = place_row((0.5 * (seen.low + seen.high) - origin) / by)
-    size = _size(0.5 * (seen.high - seen.low) / by)
-    work = _size(0.5 * (high - low) / by)
-    return _joined(np.stack(told, axis=-1), kind, axes, *region, middle, size, work)
+    limit = unit / scenery.gain[..., 0]
+    # Constants bring each number to order one.
+    numbers = {
+        "real": 1.0,
+        "anchors": count / 16,
+        "share of an anchor": 1 / count,
+        "fixed anchors": scenery.fixed.shape[-2] / 8,
+        "even": float(scenery.even),
+        "noise": np.log10(sigma),
+        "share of the growth": growth**2 / sigma**2,
+        "growth of the noise": np.log10(growth + _LEAST),
+        "radius of the body": np.log10(radius),
+        "noise as an angle": np.log10(sigma / radius),
+        "offset of the tags": np.sqrt((tags.mean(axis=-2) ** 2).sum(axis=-1)) / radius,
+        "height of the body": second[..., 2, 2] / radius**2,
+        "tags": np.log(tags.shape[-2]) - 1.7,
+        "extent of the zones": np.log10(scenery.extent / unit),
+        "nearest position": scenery.nearest / unit,
+        "inner radius": np.arcsinh(scenery.inner / unit),
+        "range limit": limit / (1 + limit),
+        "limit of the view": np.maximum(scenery.gain[..., 2], -1.0),
+    }
+    batch = origin.shape[:-1]
+    row = np.stack([np.broadcast_to(value, batch) for value in numbers.values()], axis=-1)
+    kind = np.broadcast_to(np.eye(len(KINDS))[scenery.kind], (*batch, len(KINDS)))
+    axes = np.linalg.eigvalsh(second) / (radius**2)[..., None]
+    low, high = scenery.low, scenery.high
+    corners = [place_row((point - origin) / by) for point in (low, high, 0.5 * (low + high))]
+    sizes = [_size(0.5 * (b - a) / by) for a, b in ((low, high), scenery.corners())]
+    return _joined(row, kind, axes, *corners, *sizes)
 
 
-def _views(seen: Scenery) -> FloatArray:
+def _views(scenery: Scenery) -> FloatArray:
     """Return information fractions (..., C, 10) of candidates: in each cell, and over all."""
-    low, high = seen.corners()
+    low, high = scenery.corners()
     size = np.maximum(high - low, 1e-12 * np.abs(high - low).max(axis=-1, keepdims=True))
-    share = ((seen.places - low[..., None, :]) / size[..., None, :])[..., :2]
+    share = ((scenery.places - low[..., None, :]) / size[..., None, :])[..., :2]
     cell = np.clip((share * _CELLS).astype(int), 0, _CELLS - 1)
     index = cell[..., 0] * _CELLS + cell[..., 1]
     inside = (index[..., None] == np.arange(_CELLS**2)).astype(float)
-    mean = seen.seen.mean(axis=-2)[..., None]
+    mean = scenery.visibility.mean(axis=-2)[..., None]
     number = inside.sum(axis=-2)
-    told = np.einsum("...pc,...pk->...ck", seen.seen, inside) / np.maximum(number, 1)[..., None, :]
+    told = (
+        np.einsum("...pc,...pk->...ck", scenery.visibility, inside)
+        / np.maximum(number, 1)[..., None, :]
+    )
     return _joined(np.where(number[..., None, :] > 0, told, mean), mean)
 
 

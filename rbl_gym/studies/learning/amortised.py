@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
-from rbl_gym.bounds.information import link_information
+from rbl_gym.bounds.information import add_range_information
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.problem import weighted_square
 from rbl_gym.placement.tokens import KINDS, Tokens, tokens_of
@@ -70,8 +70,8 @@ def tensors(tokens: Tokens) -> Any:
 
 def case_of(batch: Batch) -> Case:
     """Return a batch in its own units, with the information of fixed anchors in the prior."""
-    seen = batch.seen
-    origin, unit = seen.frame()
+    scenery = batch.scenery
+    origin, unit = scenery.frame()
     at, by = origin[:, None], unit[:, None, None]
     prior = batch.prior.copy()
     prior[..., 3:, 3:] *= (unit**2)[:, None, None, None]
@@ -79,26 +79,26 @@ def case_of(batch: Batch) -> Case:
     def of(x: FloatArray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
-    boxes = seen.obstacles[..., :6].copy()
+    boxes = scenery.obstacles[..., :6].copy()
     boxes[..., :3] -= at
     case = Case(
-        tags=of(seen.tags / by),
-        floor=of(seen.noise[:, 0] / unit),
-        growth=of(seen.noise[:, 1]),
+        tags=of(scenery.tags / by),
+        floor=of(scenery.noise[:, 0] / unit),
+        growth=of(scenery.noise[:, 1]),
         rotation=of(batch.rotation),
-        places=of((seen.places - at) / by),
+        places=of((scenery.places - at) / by),
         weight=of(batch.weight),
         prior=torch.as_tensor(prior),
-        low=of((seen.low - origin) / unit[:, None]),
-        high=of((seen.high - origin) / unit[:, None]),
-        inner=of(seen.inner / unit),
+        low=of((scenery.low - origin) / unit[:, None]),
+        high=of((scenery.high - origin) / unit[:, None]),
+        inner=of(scenery.inner / unit),
         outer=of(batch.outer / unit),
         middle=of(-origin / unit[:, None]),
         boxes=of(boxes / by),
         left=of(batch.left),
     )
-    if seen.fixed.shape[1]:
-        told = parts(case, of((seen.fixed - at) / by), of(batch.fixed_share)).sum(dim=1)
+    if scenery.fixed.shape[1]:
+        told = parts(case, of((scenery.fixed - at) / by), of(batch.fixed_share)).sum(dim=1)
         case = case._replace(prior=case.prior + told)
     return case
 
@@ -107,14 +107,14 @@ def loss_of(
     network: Network, batch: Batch, blur: float, entropy: float, generator: torch.Generator
 ) -> tuple[torch.Tensor, float]:
     """Return the loss of a batch, to differentiate, and the mean of log b."""
-    tokens = tensors(tokens_of(batch.seen, batch.count))
-    steps, scores = network(tokens, batch.count, batch.count + batch.seen.fixed.shape[1])
+    tokens = tensors(tokens_of(batch.scenery, batch.count))
+    steps, scores = network(tokens, batch.count, batch.count + batch.scenery.fixed.shape[1])
     case = case_of(batch)
-    kind = KINDS[batch.seen.kind]
+    kind = KINDS[batch.scenery.kind]
     if kind == "mounts":
         return _choice_loss(case, batch, scores, entropy, generator)
-    origin, unit = batch.seen.frame()
-    aim = torch.as_tensor((batch.seen.aim() - origin) / unit[:, None], dtype=torch.float32)
+    origin, unit = batch.scenery.frame()
+    aim = torch.as_tensor((batch.scenery.aim() - origin) / unit[:, None], dtype=torch.float32)
     anchors = legal(kind, case, aim[:, None] + steps)
     if case.boxes.shape[1]:
         case = some_poses(case, generator)
@@ -133,9 +133,9 @@ def _choice_loss(
     shares = logs.exp()
     size, count, _ = shares.shape
     with torch.no_grad():
-        origin, unit = batch.seen.frame()
-        spots = (batch.seen.candidates - origin[:, None]) / unit[:, None, None]
-        told = torch.as_tensor(alone(case, spots, batch.seen.seen))
+        origin, unit = batch.scenery.frame()
+        spots = (batch.scenery.candidates - origin[:, None]) / unit[:, None, None]
+        told = torch.as_tensor(alone(case, spots, batch.scenery.visibility))
         drawn = torch.multinomial(shares.flatten(0, 1), 1, generator=generator)
         drawn = drawn.view(size, count)
         at = torch.arange(size)[:, None]
@@ -163,7 +163,7 @@ def alone(case: Case, spots: FloatArray, share: FloatArray) -> FloatArray:
     floor, growth = case.floor.double().numpy(), case.growth.double().numpy()
     law = np.stack([0 * floor, floor, growth, 0 * floor - 1], axis=-1)
     links = np.swapaxes(share, 1, 2)[..., None, None]
-    return link_information(
+    return add_range_information(
         np.zeros((6, 6)), spots[:, :, None, None], tags[:, None, None], rotation[:, None],
         places[:, None], law[:, None, None],
         np.broadcast_to(links, (*links.shape[:-1], tags.shape[1])),
@@ -250,7 +250,7 @@ def _round(
 def _sizes(rng: np.random.Generator) -> dict[str, int]:
     """Return the row lengths of the tokens."""
     batch = placement_families.draw("rooms", rng, 2)
-    found = tokens_of(batch.seen, batch.count)
+    found = tokens_of(batch.scenery, batch.count)
     return {name: getattr(found, name).shape[-1] for name in Tokens._fields}
 
 

@@ -100,7 +100,7 @@ def _plain(rng: np.random.Generator, where: _Where) -> Batch:
         sight = Obstacles(where.obstacles, 0.0)
         views = _kept(sight.share(candidates, places), left)
         fixed_share = _kept(sight.share(where.fixed, places), left)
-    seen = Scenery(
+    scenery = Scenery(
         kind=KINDS.index(where.kind),
         low=low,
         high=high,
@@ -117,11 +117,11 @@ def _plain(rng: np.random.Generator, where: _Where) -> Batch:
         places=places,
         candidates=candidates,
         normals=normals,
-        seen=views,
+        visibility=views,
     )
     prior = priors(where.extent, _POSES)
     return Batch(
-        seen, draw_count(rng, n_fixed), rotation, weight, prior, where.outer, left, fixed_share
+        scenery, draw_count(rng, n_fixed), rotation, weight, prior, where.outer, left, fixed_share
     )
 
 

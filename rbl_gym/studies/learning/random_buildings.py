@@ -13,7 +13,7 @@ from rbl_gym.geometry.obstacles import Obstacles, Prisms, box_bounds
 from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.building import cube
-from rbl_gym.placement.tokens import KINDS, Scenery, turned
+from rbl_gym.placement.tokens import KINDS, Scenery, mirrored
 from rbl_gym.studies.learning.random_problems import (
     Batch,
     body_and_noise,
@@ -33,7 +33,7 @@ def buildings(rng: np.random.Generator, size: int) -> Batch:
     found = _Building(*(np.stack(column) for column in zip(*rows, strict=True)))
     tags, noise = body_and_noise(rng, size, found.extent)
     none = np.zeros(size)
-    seen = Scenery(
+    scenery = Scenery(
         kind=KINDS.index("mounts"),
         low=found.spots.min(axis=1),
         high=found.spots.max(axis=1),
@@ -50,13 +50,13 @@ def buildings(rng: np.random.Generator, size: int) -> Batch:
         places=found.places,
         candidates=found.spots,
         normals=found.normals,
-        seen=found.views,
+        visibility=found.views,
     )
     fixed = np.take_along_axis(found.spots, found.fixed[..., None], axis=1)
-    low, high = seen.corners()
+    low, high = scenery.corners()
     away = np.linalg.norm(found.spots - 0.5 * (low + high)[:, None], axis=-1)
     return Batch(
-        seen._replace(fixed=fixed, nearest=away.min(axis=-1)),
+        scenery._replace(fixed=fixed, nearest=away.min(axis=-1)),
         draw_count(rng, n_fixed),
         found.rotation,
         found.weight,
@@ -69,10 +69,10 @@ def buildings(rng: np.random.Generator, size: int) -> Batch:
 
 def again(rng: np.random.Generator, batch: Batch) -> Batch:
     """Return a mirror image of the same buildings, with other bodies, noise and numbers."""
-    seen = turned(batch.seen, int(rng.integers(8)))
-    tags, noise = body_and_noise(rng, len(seen.extent), seen.extent)
-    count = draw_count(rng, seen.fixed.shape[1])
-    return batch._replace(seen=seen._replace(tags=tags, noise=noise), count=count)
+    scenery = mirrored(batch.scenery, int(rng.integers(8)))
+    tags, noise = body_and_noise(rng, len(scenery.extent), scenery.extent)
+    count = draw_count(rng, scenery.fixed.shape[1])
+    return batch._replace(scenery=scenery._replace(tags=tags, noise=noise), count=count)
 
 
 class _Building(NamedTuple):

@@ -17,13 +17,13 @@ _TURN_STD = math.radians(60)
 class Batch(NamedTuple):
     """Problems of one family as arrays with one leading axis.
 
-    `seen` is the input of the network, `count` the number of anchors to place; then rotations (B,
-    P, 3, 3) and weights (B, P) of the poses at `Scenery.places`, and the prior information (B, P,
-    6, 6); the outer radius (B,) of shells; the shares of a link's information that boxes leave
-    (B,), and of the links of fixed anchors (B, P, F).
+    `scenery` is the input of the network, `count` the number of anchors to place; then rotations
+    (B, P, 3, 3) and weights (B, P) of the poses at `Scenery.places`, and the prior information
+    (B, P, 6, 6); the outer radius (B,) of shells; the shares of a link's information that boxes
+    leave (B,), and of the links of fixed anchors (B, P, F).
     """
 
-    seen: Scenery
+    scenery: Scenery
     count: int
     rotation: FloatArray
     weight: FloatArray

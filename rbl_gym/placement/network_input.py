@@ -99,7 +99,7 @@ def _scenery(
         places=places,
         candidates=candidates,
         normals=normals,
-        seen=link_shares(scene, obstacles, candidates, places),
+        visibility=link_shares(scene, obstacles, candidates, places),
         shown=shown,
         **known,
     )
