@@ -305,18 +305,18 @@ def test_craft_numbers_change_nothing_when_sorted(sort):
     turn = np.array([2, 0, 3, 1])
     env = MobileAnchorsVectorEnv(8, scene={"name": "auv_craft", "n_anchors": 4}, sort_craft=sort)
     env.reset(seed=3)
-    seen = env.seen
+    seen = env.inner_observation
     assert seen is not None
     other = {**seen, "anchors": seen["anchors"][:, turn]}
-    assert np.array_equal(env._show(seen, env.scene), env._show(other, env.scene)) is sort
+    assert np.array_equal(env._task_view(seen, env.scene), env._task_view(other, env.scene)) is sort
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 8))
     env.step(actions)
     moved = env.anchors
     env.reset(seed=3)
-    env.seen = other
-    env._show(other, env.scene)
+    env.inner_observation = other
+    env._task_view(other, env.scene)
     renumbered = env._command(actions).reshape(8, 4, 3)
-    env.seen = seen
+    env.inner_observation = seen
     # The same craft get the same commands, whatever their numbers.
     back = np.argsort(turn)
     env.inner.step(renumbered[:, back].reshape(8, 12))

@@ -79,14 +79,14 @@ def test_a_task_in_other_worlds_keeps_what_else_it_says():
     assert task.arguments == {"k": 3, "scene": {"name": "hall", "steps": 5}}
     assert task.make(2).episode_steps == 5
     task = rl_task("selection").in_worlds(scenes=["hall"])
-    assert task.family().n_anchors == 12
+    assert task.scene_family().n_anchors == 12
     assert rl_task("selection").in_worlds() is rl_task("selection")
     with pytest.raises(ValueError, match="must be left out if scenes is given"):
         task.in_worlds("hall", ["hall"])
 
 
 def test_a_task_of_one_scene_is_a_family_of_one():
-    assert [one.n_anchors for one in rl_task("mobile-hard").family().corners] == [2]
+    assert [one.n_anchors for one in rl_task("mobile-hard").scene_family().corners] == [2]
 
 
 # --- the worlds in a policy's file ------------------------------------------------------------

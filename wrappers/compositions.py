@@ -36,9 +36,9 @@ from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 class Task(StatedLength):
     """Base of scalar and vector tasks. In the vector form arrays have leading axes (B,).
 
-    A subclass implements `_spaces`, `_command` and `_show`; `_below` if a wrapper lies between the
-    environment and the filter, and `_price` if actions have a cost. Its ``__init__`` sets `scene`
-    and `family`, then calls `_compose`.
+    A subclass implements `_spaces`, `_command` and `_task_view`; `_below` if a wrapper lies between
+    the environment and the filter, and `_price` if actions have a cost. Its ``__init__`` sets
+    `scene` and `family`, then calls `_compose`.
 
     Attributes
     ----------
@@ -48,14 +48,14 @@ class Task(StatedLength):
         The scene; of a family, the first of its scenes.
     family
         The family from which every reset draws a scene; None if there is only one scene.
-    seen
+    inner_observation
         The last observation of `inner`, None before the first reset.
     """
 
     inner: Any = None
     scene: Scene
     family: SceneFamily | None = None
-    seen: dict[str, np.ndarray] | None = None
+    inner_observation: dict[str, np.ndarray] | None = None
     # The view of the belief; None means the task's own view.
     _viewer: Viewer | None = None
 
@@ -72,26 +72,26 @@ class Task(StatedLength):
     @property
     def belief(self) -> PoseBelief:
         """The present belief of the filter."""
-        return _belief_of(self._told())
+        return _belief_of(self._last_observation())
 
     @property
     def anchors(self) -> FloatArray:
         """Present positions of the anchors, (..., M, 3)."""
-        return self._told()["anchors"]
+        return self._last_observation()["anchors"]
 
     @property
     def twist(self) -> FloatArray:
         """Known twist (..., 6) of the interval that ends at this epoch."""
-        return self._told()["twist"]
+        return self._last_observation()["twist"]
 
     def render(self) -> Any:
         """Return a frame, (height, width, 3), uint8; a vector form returns one for each world."""
         return self.inner.render()
 
-    def _told(self) -> dict[str, np.ndarray]:
-        if self.seen is None:
-            raise gym.error.ResetNeeded("call reset() before step()")
-        return self.seen
+    def _last_observation(self) -> dict[str, np.ndarray]:
+        if self.inner_observation is None:
+            raise gym.error.ResetNeeded("call reset() first")
+        return self.inner_observation
 
     def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         """Return the spaces of the task's own view and of the actions, of one world."""
@@ -105,22 +105,21 @@ class Task(StatedLength):
         """Return the action of `inner` for a valid action of the task."""
         raise NotImplementedError
 
-    def _show(self, observation: dict[str, np.ndarray], world: Any) -> np.ndarray:
+    def _task_view(self, observation: dict[str, np.ndarray], world: Any) -> np.ndarray:
         """Return the policy's view of an observation of `inner` in a `Scene` or `StackedScenes`."""
         raise NotImplementedError
 
     @property
-    def _worlds(self) -> dict[str, Any]:
+    def _env_arguments(self) -> dict[str, Any]:
         """The arguments of the environment."""
         worlds = {"scene": self.scene} if self.family is None else {"scenes": self.family}
         return {**worlds, "reward": "none"}
 
-    def _look_by(self, observation: ViewLike, hides_obstacles: bool = False) -> None:
+    def _set_viewer(self, observation: ViewLike, hides_obstacles: bool = False) -> None:
         """Set how the policy observes the belief; ``"flat"`` is the task's own view."""
         if isinstance(observation, str) and observation == "flat":
             return
-        self._viewer = viewer_of(observation)
-        self._viewer.hides_obstacles = hides_obstacles
+        self._viewer = viewer_of(observation, hides_obstacles)
 
     def _space_of(self, own: spaces.Space[Any], inner: Any) -> spaces.Space[Any]:
         """Return the observation space of one world; `own` is that of the task's own view."""
@@ -129,18 +128,18 @@ class Task(StatedLength):
         below = getattr(inner, "single_observation_space", inner.observation_space)
         return self._viewer.space_of(inner, scene_of(inner), below)
 
-    def _view_of(self, observation: dict[str, np.ndarray], world: Any) -> Any:
+    def _observe(self, observation: dict[str, np.ndarray], world: Any) -> Any:
         """Return the policy's view of an observation of `inner`; the caller may keep it."""
         if self._viewer is None:
-            return self._show(observation, world)
+            return self._task_view(observation, world)
         shown = self._viewer(Seen(observation, _belief_of(observation), world))
         if isinstance(shown, dict):
             return {key: np.array(field) for key, field in shown.items()}
         return shown
 
-    def _shown(self) -> Any:
+    def _present_view(self) -> Any:
         """Return the present view of the policy."""
-        return self._view_of(self._told(), self.world)
+        return self._observe(self._last_observation(), self.world)
 
     @property
     def world(self) -> Any:
@@ -177,7 +176,7 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
     ) -> None:
         """Make the stack and the spaces."""
         own, self.action_space = self._spaces()
-        env = self._below(TrackingEnv(**self._worlds, render_mode=render_mode))
+        env = self._below(TrackingEnv(**self._env_arguments, render_mode=render_mode))
         self.inner = EstimatePose(env, *filter_of_task(filter, options), reward)
         self.render_mode = render_mode
         self.observation_space = self._space_of(own, self.inner)
@@ -186,17 +185,17 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode; `options` must be empty."""
-        self.seen, info = self.inner.reset(seed=seed, options=options)
+        self.inner_observation, info = self.inner.reset(seed=seed, options=options)
         world = self.inner.unwrapped
         self._np_random, self._np_random_seed = world.np_random, world.np_random_seed
-        return self._shown(), info
+        return self._present_view(), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the world and its filter."""
-        self._told()
+        self._last_observation()
         action = check_actions("action", action, self.action_space)
-        self.seen, reward, *ended, info = self.inner.step(self._command(action))
-        return self._shown(), float(reward - self._price(info)), *ended, info
+        self.inner_observation, reward, *ended, info = self.inner.step(self._command(action))
+        return self._present_view(), float(reward - self._price(info)), *ended, info
 
     def close(self) -> None:
         """Close the stack."""
@@ -219,7 +218,7 @@ class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIn
         """Make the stack and the spaces."""
         own, self.single_action_space = self._spaces()
         envs = TrackingVectorEnv(
-            num_envs, **self._worlds, render_mode=render_mode,
+            num_envs, **self._env_arguments, render_mode=render_mode,
             max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
         )  # fmt: skip
         below = self._below(envs)
@@ -233,23 +232,23 @@ class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIn
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
-        self.seen, info = self.inner.reset(seed=seed, options=options)
-        return self._shown(), info
+        self.inner_observation, info = self.inner.reset(seed=seed, options=options)
+        return self._present_view(), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Step every world and its filter."""
-        self._told()
+        self._last_observation()
         world = self.world
         actions = check_actions("actions", actions, self.single_action_space, self.num_envs)
-        self.seen, reward, *ended, info = self.inner.step(self._command(actions))
+        self.inner_observation, reward, *ended, info = self.inner.step(self._command(actions))
         price = self._price(info)
         if "final_obs" in info:
             final = info["_final_obs"]
             for i in np.flatnonzero(final):
                 scene = world if isinstance(world, Scene) else world.scenes[i]
-                info["final_obs"][i] = self._view_of(info["final_obs"][i], scene)
+                info["final_obs"][i] = self._observe(info["final_obs"][i], scene)
             price = np.where(final, self._price(info["final_info"]), price)
-        return self._shown(), reward - price, *ended, info
+        return self._present_view(), reward - price, *ended, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the stack if there is one: `__del__` also closes after a failed constructor."""

@@ -181,7 +181,7 @@ def _cut(entries: FloatArray) -> np.ndarray:
 # --- views of an environment ------------------------------------------------------------------
 
 
-def viewer_of(observation: ViewLike) -> Viewer:
+def viewer_of(observation: ViewLike, hides_obstacles: bool = False) -> Viewer:
     """Return the viewer for the argument `observation`.
 
     Parameters
@@ -192,13 +192,15 @@ def viewer_of(observation: ViewLike) -> Viewer:
         the result has it, too. The attribute `space` of the function is the Gymnasium space of one
         world. Without this attribute the function is called once, and the space has boxes of the
         shapes and types that it returns.
+    hides_obstacles
+        Whether ``"tokens"`` leaves obstacles out.
 
     Raises
     ------
     ValueError
         If the name is unknown, the path cannot be imported, or the type is wrong.
     """
-    return Viewer(*chosen_view(observation, OBSERVATIONS))
+    return Viewer(*chosen_view(observation, OBSERVATIONS), hides_obstacles=hides_obstacles)
 
 
 @dataclass

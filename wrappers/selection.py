@@ -67,7 +67,11 @@ class _AnchorSelection(Task):
 
     def _command(self, action: np.ndarray) -> BoolArray:
         """Return whether an action chooses each anchor (..., M); ties go to the lower number."""
-        there = None if self.family is None else self._told()["anchor_mask"].astype(np.bool_)
+        there = (
+            None
+            if self.family is None
+            else self._last_observation()["anchor_mask"].astype(np.bool_)
+        )
         if self._subsets is not None:
             chosen = self._subsets[action]
         elif self.mode == "priced":
@@ -97,7 +101,7 @@ class _AnchorSelection(Task):
         """
         if self.mode == "top-k":
             raise ValueError("mode must be 'subset' or 'priced' for action masks, got 'top-k'")
-        told = self._told()
+        told = self._last_observation()
         there = np.ones(told["links"].shape[:-1], dtype=np.bool_)
         if self.family is not None:
             there = told["anchor_mask"].astype(np.bool_)
@@ -110,7 +114,7 @@ class _AnchorSelection(Task):
     def _price(self, info: dict[str, Any]) -> Any:
         return self.price * info["chosen"].sum(axis=-1) if self.mode == "priced" else 0.0
 
-    def _show(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
+    def _task_view(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
         middle, half = self._centre, self._half
         if self.family is not None:
             middle, half, *_ = world.scales
@@ -144,7 +148,7 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
         observation: ViewLike = "flat",
     ) -> None:
         self._configure(mode, k, price, scene, scenes)
-        self._look_by(observation, hides_obstacles=True)
+        self._set_viewer(observation, hides_obstacles=True)
         self._compose(
             num_envs, filter, options, reward, render_mode, max_episode_steps, autoreset_mode
         )
@@ -234,7 +238,7 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
         observation: ViewLike = "flat",
     ) -> None:
         self._configure(mode, k, price, scene, scenes)
-        self._look_by(observation, hides_obstacles=True)
+        self._set_viewer(observation, hides_obstacles=True)
         self._compose(filter, options, reward, render_mode)
 
 

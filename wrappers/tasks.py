@@ -67,21 +67,21 @@ class _MobileAnchors(Task):
         velocity[(*worlds_of(batch), self.order, slice(2))] = action.reshape(*batch, m, 2)
         return velocity.reshape(*batch, 3 * m)
 
-    def _view_of(self, observation: dict[str, np.ndarray], world: Any) -> Any:
-        if self._viewer is not None and observation is self.seen:
+    def _observe(self, observation: dict[str, np.ndarray], world: Any) -> Any:
+        if self._viewer is not None and observation is self.inner_observation:
             # Craft are in the order of their numbers.
             count = np.arange(self._n_craft)
             self.order = np.broadcast_to(count, observation["anchors"].shape[:-1])
-        return super()._view_of(observation, world)
+        return super()._observe(observation, world)
 
-    def _show(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
+    def _task_view(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
         told = [observation[key] for key in _CRAFT_VIEW]
         if self.family is None:
             order, flat = self._view(*told)
         else:
             reach = views.reach_of_craft(world)
             order, flat = views.padded_craft(self._view, told, observation["anchor_mask"], reach)
-        if observation is self.seen:
+        if observation is self.inner_observation:
             self.order = order
         return flat.astype(np.float32)
 
@@ -110,7 +110,7 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
         observation: ViewLike = "flat",
     ) -> None:
         self._configure(difficulty, scene, sort_craft, scenes)
-        self._look_by(observation)
+        self._set_viewer(observation)
         self._compose(
             num_envs, filter, options, reward, render_mode, max_episode_steps, autoreset_mode
         )
@@ -192,5 +192,5 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
         observation: ViewLike = "flat",
     ) -> None:
         self._configure(difficulty, scene, sort_craft, scenes)
-        self._look_by(observation)
+        self._set_viewer(observation)
         self._compose(filter, options, reward, render_mode)

@@ -241,7 +241,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
             observation["inertial"] = at.readings.copy()
             info["velocity"], info["inertial_bias"] = at.velocity, at.bias
         if self.family is not None:
-            observation = self.family.padded(observation, self.scene)
+            observation = self.family.pad(observation, self.scene)
             info["nlos"] = families.padded(info["nlos"], self.family.fields["links"][0])
             if surveyed:
                 info["anchors"] = families.padded(info["anchors"], (self.family.n_anchors, 3))

@@ -118,7 +118,7 @@ class SceneFamily:
             fields["quality"] = ((m,), np.float64)
         return fields
 
-    def padded(self, told: Mapping[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
+    def pad(self, told: Mapping[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
         """Return the observation of a scene, padded to the family's shapes, with its masks."""
         told = {
             **told,

@@ -134,7 +134,7 @@ def _rolled_out(
     for k in range(steps + 1):
         seen = craft_seen(env)
         told = [one.astype(np.float32) for one in (seen.own, seen.pairs, seen.others)]
-        there = env.seen.get("anchor_mask", np.ones(seen.own.shape[:2], np.int8))
+        there = env.inner_observation.get("anchor_mask", np.ones(seen.own.shape[:2], np.int8))
         mean, value = seen.orbit.astype(np.float32), np.zeros(len(there), np.float32)
         for count, which in _by_count(there):
             own = _trimmed(count, which, *told)

@@ -80,7 +80,7 @@ class RlTask:
         kept = {k: v for k, v in self.arguments.items() if k not in ("scene", "scenes")}
         return dataclasses.replace(self, arguments={**kept, **given})
 
-    def family(self) -> SceneFamily:
+    def scene_family(self) -> SceneFamily:
         """The scenes of the environment, for a task with a filter in the loop."""
         env = self.make(1)
         return env.family or family([env.scene])

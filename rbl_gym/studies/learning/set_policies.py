@@ -67,7 +67,7 @@ def _batched(env: Any, *arrays: np.ndarray) -> list[np.ndarray]:
 
 
 def _mask(env: Any) -> np.ndarray:
-    seen: Mapping[str, np.ndarray] = env.seen
+    seen: Mapping[str, np.ndarray] = env.inner_observation
     mask = seen.get("anchor_mask", np.ones(env.anchors.shape[:-1]))
     return _batched(env, mask)[0].astype(np.float64)
 
@@ -141,8 +141,10 @@ class _Chooser:
 
 def _sight(env: Any) -> np.ndarray:
     """Return 1 if an anchor saw the body in the last step, else -1."""
-    (links,) = _batched(env, env.seen["links"])
-    (quality,) = _batched(env, env.seen.get("quality", np.ones(env.anchors.shape[:-1])))
+    (links,) = _batched(env, env.inner_observation["links"])
+    (quality,) = _batched(
+        env, env.inner_observation.get("quality", np.ones(env.anchors.shape[:-1]))
+    )
     return np.where(links.any(axis=-1) & (quality > 0.5), 1.0, -1.0)
 
 

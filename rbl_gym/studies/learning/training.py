@@ -152,7 +152,7 @@ def _taught(
 
         kind = "sight"
         k = int(task.arguments.get("k", 3))
-        network, curve = train_sight(task.family(), k, steps, seed, advance)
+        network, curve = train_sight(task.scene_family(), k, steps, seed, advance)
     figures = {"env_share": None, "curve": curve}
     return lambda meta: SetPolicy(network.arrays(), kind, meta), figures
 

@@ -131,9 +131,9 @@ def _moments(env: gym.Env[Any, Any], infos: Iterator[dict[str, Any]]) -> Iterato
         at, anchors = simulation.epoch_of(episode, epoch), world._anchors.copy()
         quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
         measured = simulation.measure_epoch(scene, at, anchors, quality)
-        if isinstance(base, TaskEnv) and base.seen is not None:
+        if isinstance(base, TaskEnv) and base.inner_observation is not None:
             # The policy may choose which anchors measure.
-            chosen: BoolArray = unpadded(base.seen, scene)["links"].astype(np.bool_)
+            chosen: BoolArray = unpadded(base.inner_observation, scene)["links"].astype(np.bool_)
             ranges = np.where(chosen, measured.ranges, 0.0)
             measured = measured._replace(ranges=ranges, links=chosen, nlos=measured.nlos & chosen)
         told = simulation.surveyed(at, anchors)
