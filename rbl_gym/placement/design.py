@@ -27,9 +27,10 @@ STAGES, _KEPT = (256, 1024, 2048), (2, 1, 1)
 _FRESH, _STEPS = 3, 12
 # Gradient steps without obstacles: the gradient alone then finds the layout.
 _STEPS_FREE = 40
-# Number of greedy candidates, largest number of anchors in all greedy starts together, and
-# largest number of greedy starts.
-_CANDIDATES, _ANCHORS, _STARTS = 400, 32, 4
+# Number of candidates of a greedy start.
+_CANDIDATES = 400
+# There are so many greedy starts, or fewer if together they had more than so many anchors.
+_STARTS, _ANCHORS = 4, 32
 
 
 def find_layout(
@@ -80,20 +81,23 @@ def _starts(
     count: int,
     given: Mapping[str, FloatArray],
 ) -> dict[str, FloatArray]:
-    """Return layouts (`count`, 3): given ones, and greedy with swaps for draws of candidates."""
+    """Return layouts (`count`, 3): greedy with swaps for draws of candidates, and given ones."""
     most = 1 if problem.mounts.listed() is not None else max(1, min(_STARTS, _ANCHORS // count))
-    found: dict[str, FloatArray] = {}
-    for number in range(most):
-        candidates = free_candidates(problem, rng, max(_CANDIDATES, 4 * count))
-        parts = setting.parts(candidates)
-        chosen = swap(setting, parts, choose(setting, parts, count))
-        found["greedy" if not number else f"greedy {number + 1}"] = candidates[chosen]
-        if number:
-            continue
-        for name, start in given.items():
-            added = choose(setting.with_fixed(start), parts, count - len(start))
-            found[name] = np.concatenate([start, candidates[added]])
+    number = max(_CANDIDATES, 4 * count)
+    first, *others = (free_candidates(problem, rng, number) for _ in range(most))
+    parts = setting.parts(first)
+    found = {"greedy": first[_greedy(setting, parts, count)]}
+    for name, start in given.items():
+        added = choose(setting.with_fixed(start), parts, count - len(start))
+        found[name] = np.concatenate([start, first[added]])
+    for k, drawn in enumerate(others, start=2):
+        found[f"greedy {k}"] = drawn[_greedy(setting, setting.parts(drawn), count)]
     return found
+
+
+def _greedy(setting: Setting, parts: FloatArray, count: int) -> list[int]:
+    """Return the indices of `count` candidates, chosen greedily and then swapped."""
+    return swap(setting, parts, choose(setting, parts, count))
 
 
 def _improved(
