@@ -27,24 +27,21 @@ from tests.test_policies import random_policy
 
 SHORT: dict[str, tuple[RlTask, type, tuple[int, ...], str]] = {
     "mobile": (
-        RlTask("RBL/MobileAnchors-v0", {"scene": {"name": "auv_craft", "steps": 4}}, 1, 1),
+        RlTask("RBL/MobileAnchors-v0", {"scene": {"name": "auv_craft", "steps": 4}}),
         MobileAnchorsEnv, (24, 8, 6), "box",
     ),
     "selection": (
-        RlTask("RBL/AnchorSelection-v0", {"k": 2, "scene": {"name": "hall", "steps": 5}}, 1, 1),
+        RlTask("RBL/AnchorSelection-v0", {"k": 2, "scene": {"name": "hall", "steps": 5}}),
         AnchorSelectionEnv, (18, 8, 12), "box",
     ),
     "priced": (
         RlTask("RBL/AnchorSelection-v0",
-               {"mode": "priced", "price": 0.2, "scene": {"name": "hall", "steps": 5}}, 1, 1),
+               {"mode": "priced", "price": 0.2, "scene": {"name": "hall", "steps": 5}}),
         AnchorSelectionEnv, (18, 8, 12), "multi-binary",
     ),
 }  # fmt: skip
 MOUNTS = RlTask(
-    "RBL/AnchorPlacement-v0",
-    {"scene": "uwb_room", "racks": 1, "mode": "mounts", "n_anchors": 3},
-    1,
-    1,
+    "RBL/AnchorPlacement-v0", {"scene": "uwb_room", "racks": 1, "mode": "mounts", "n_anchors": 3}
 )
 
 

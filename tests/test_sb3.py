@@ -21,7 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 from rbl_gym.app.cli import main
 from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.studies.learning import policies, training
-from rbl_gym.studies.learning.rl_tasks import RlTask
+from rbl_gym.studies.learning.rl_tasks import RlTask, Training
 from rbl_gym.wrappers.sb3 import Sb3VecEnv
 from rbl_gym.wrappers.tasks import MobileAnchorsEnv
 
@@ -177,7 +177,8 @@ def test_trainings_of_different_seeds_see_different_worlds(monkeypatch):
         return envs
 
     monkeypatch.setattr(RlTask, "make", make)
-    task = RlTask("RBL/AnchorPlacement-v0", {}, 64, 4, num_envs=16, batch_size=64, epochs=1)
+    short = Training(64, 4, num_envs=16, batch_size=64, epochs=1)
+    task = RlTask("RBL/AnchorPlacement-v0", {}, short)
     for seed in (0, 1):
         training.train("auv_buoys", task, 64, seed, lambda _: None)
     assert [len(worlds) for worlds in seen] == [16, 16]

@@ -13,7 +13,7 @@ from rbl_gym.app import learning_commands
 from rbl_gym.app.cli import main
 from rbl_gym.studies.learning import policies, trained_worlds
 from rbl_gym.studies.learning.policies import Policy
-from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
+from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, Training, rl_task
 from rbl_gym.studies.learning.set_policies import SetPolicy
 from rbl_gym.worlds.families import family
 from rbl_gym.worlds.scene_source import read_scene, read_scenes
@@ -168,11 +168,16 @@ def test_a_building_that_changed_since_the_training_is_named(monkeypatch, tmp_pa
 # --- training ---------------------------------------------------------------------------------
 
 FEW = RlTask(
-    "RBL/MobileAnchors-v0", {"scenes": [DRAWN]}, 24, 3, 0.9, num_envs=4, algorithm="set-ppo"
+    "RBL/MobileAnchors-v0",
+    {"scenes": [DRAWN]},
+    Training(24, 3, 0.9, num_envs=4, algorithm="set-ppo"),
 )
-HALL = RlTask("RBL/AnchorSelection-v0", {"scene": {"name": "hall", "steps": 3}}, 9, 3, num_envs=3)
-PRICED = RlTask(HALL.env_id, {**HALL.arguments, "mode": "priced"}, 9, 3, num_envs=3)
-MOUNTS = RlTask("RBL/AnchorPlacement-v0", dict(TASKS["mounts"].arguments), 20, 5, num_envs=4)
+SHORT = Training(9, 3, num_envs=3)
+HALL = RlTask("RBL/AnchorSelection-v0", {"scene": {"name": "hall", "steps": 3}}, SHORT)
+PRICED = RlTask(HALL.env_id, {**HALL.arguments, "mode": "priced"}, SHORT)
+MOUNTS = RlTask(
+    "RBL/AnchorPlacement-v0", dict(TASKS["mounts"].arguments), Training(20, 5, num_envs=4)
+)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +223,7 @@ def test_every_way_to_train_makes_a_policy_that_plays(monkeypatch, tmp_path, tas
 def test_what_cannot_learn_a_task_is_named(task, algorithm, message):
     from rbl_gym.studies.learning import training
 
-    assert {one.algorithm for one in TASKS.values()} <= set(training.ALGORITHMS)
+    assert {one.training.algorithm for one in TASKS.values()} <= set(training.ALGORITHMS)
     with pytest.raises(ValueError, match=message):
         training.train(task, rl_task(task), 10, 0, algorithm=algorithm)
 

@@ -158,7 +158,7 @@ def _train(options: argparse.Namespace) -> int:
 
     worlds = _worlds(options)
     task = rl_task(options.task).in_worlds(**worlds)
-    steps = options.steps or task.steps
+    steps = options.steps or task.training.steps
     path = Path(options.out or f"out/{options.task}-{options.seed}.npz")
     algorithm = training.check_training(task, options.seed, options.algorithm)
     with progress(f"{algorithm} on {_title(options)}", steps) as advance:
@@ -180,7 +180,7 @@ def _command(options: argparse.Namespace, steps: int, algorithm: str) -> str:
     """Return the command that trains the policy again."""
     worlds = {"--scene": options.scene, "--family": options.family}
     told = [f"{flag} {value}" for flag, value in worlds.items() if value]
-    if algorithm != rl_task(options.task).algorithm:
+    if algorithm != rl_task(options.task).training.algorithm:
         told.append(f"--algorithm {algorithm}")
     return " ".join(
         ["rbl-gym train", options.task, *told, f"--steps {steps} --seed {options.seed}"]

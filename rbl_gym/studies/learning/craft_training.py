@@ -95,15 +95,16 @@ def train_craft(
     torch.manual_seed(seed)
     rng, learner = np.random.default_rng(seed), _Learner.new()
     rates = [group["lr"] for group in learner.optimizer.param_groups]
-    env = task.make(task.num_envs)
+    settings = task.training
+    env = task.make(settings.num_envs)
     env.reset(seed=seed * SEED_STRIDE)
-    each = task.num_envs * task.rollout
+    each = settings.num_envs * settings.rollout
     curve, rewards, every = [], [], max(1, -(-steps // each) // 50)
     for done in range(0, steps, each):
         for group, rate in zip(learner.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * max(0.05, 1 - done / steps)
-        rollout, beyond = _rolled_out(env, learner, task.rollout, rng)
-        advantage, target = _advantages(rollout, beyond, task.gamma, task.gae_lambda)
+        rollout, beyond = _rolled_out(env, learner, settings.rollout, rng)
+        advantage, target = _advantages(rollout, beyond, settings.gamma, settings.gae_lambda)
         _learn(learner, rollout, advantage, target, rng)
         rewards.append(float(rollout.reward.mean()))
         if len(rewards) == every:

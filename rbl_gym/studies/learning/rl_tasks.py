@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ import gymnasium as gym
 from rbl_gym.checks import check_one_of
 from rbl_gym.worlds.families import SceneFamily, family
 
-__all__ = ["TASKS", "RlTask", "rl_task", "task_of"]
+__all__ = ["TASKS", "RlTask", "Training", "rl_task", "task_of"]
 
 # Worlds of a training or evaluation have the seeds from SEED_STRIDE times its own seed on. Seeds of
 # evaluations lie beyond those of all trainings.
@@ -20,13 +21,11 @@ HELD_OUT_SEED = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class RlTask:
-    """An environment with arguments, and the settings of PPO.
+class Training:
+    """Settings of the training of a task.
 
     Parameters
     ----------
-    env_id, arguments
-        Arguments of `gym.make_vec`.
     steps
         Environment steps of a training.
     rollout
@@ -39,10 +38,8 @@ class RlTask:
         Default algorithm, a name of `training.ALGORITHMS`.
     """
 
-    env_id: str
-    arguments: dict[str, Any]
-    steps: int
-    rollout: int
+    steps: int = 600_000
+    rollout: int = 13
     gamma: float = 1.0
     gae_lambda: float = 1.0
     num_envs: int = 64
@@ -52,6 +49,23 @@ class RlTask:
     hidden: tuple[int, ...] = (128, 128)
     log_std_init: float = -0.5
     algorithm: str = "ppo"
+
+
+@dataclass(frozen=True)
+class RlTask:
+    """An environment with arguments, and the settings of its training.
+
+    Parameters
+    ----------
+    env_id, arguments
+        Arguments of `gym.make_vec`.
+    training
+        Settings of the training.
+    """
+
+    env_id: str
+    arguments: dict[str, Any]
+    training: Training = Training()
 
     def make(self, num_envs: int, autoreset_mode: str = "SameStep") -> Any:
         """Return the vector environment."""
@@ -82,29 +96,28 @@ class RlTask:
 
     def scene_family(self) -> SceneFamily:
         """The scenes of the environment, for a task with a filter in the loop."""
-        env = self.make(1)
-        return env.family or family([env.scene])
+        with contextlib.closing(self.make(1)) as env:
+            return env.family or family([env.scene])
 
 
 def _mobile(steps: int, rollout: int, **arguments: Any) -> RlTask:
     # Per world, a step of the filter with 256 worlds costs a third of that with 64.
-    return RlTask(
-        "RBL/MobileAnchors-v0", arguments, steps, rollout, gamma=0.95, gae_lambda=0.9, num_envs=256
-    )
+    training = Training(steps, rollout, gamma=0.95, gae_lambda=0.9, num_envs=256)
+    return RlTask("RBL/MobileAnchors-v0", arguments, training)
 
 
 def _selection(**arguments: Any) -> RlTask:
     # A choice affects a few steps only, and a short horizon is learned faster.
-    return RlTask(
-        "RBL/AnchorSelection-v0", arguments, 600_000, 13, gamma=0.8, gae_lambda=0.9, num_envs=256
-    )
+    training = Training(600_000, 13, gamma=0.8, gae_lambda=0.9, num_envs=256)
+    return RlTask("RBL/AnchorSelection-v0", arguments, training)
 
 
 def _placement(steps: int, n_anchors: int, log_std_init: float = -1.5, **arguments: Any) -> RlTask:
-    # A larger deviation at the start moves anchors apart by chance: their means then stay together.
-    # `uwb_room` reaches .895 with this one, and .912 with its own (docs/learning.md).
-    rollout = 4 * n_anchors
-    return RlTask("RBL/AnchorPlacement-v0", arguments, steps, rollout, log_std_init=log_std_init)
+    # With a larger standard deviation of the actions at the start, anchors are apart by chance, and
+    # their means do not learn to be. `uwb_room` is an exception: its score is .895 with -1.5, and
+    # .912 with -0.5 (docs/learning.md).
+    training = Training(steps, 4 * n_anchors, log_std_init=log_std_init)
+    return RlTask("RBL/AnchorPlacement-v0", arguments, training)
 
 
 # Two slow craft need the most skill: they are drawn in more than half of the worlds. Three slow
@@ -141,14 +154,14 @@ TASKS: dict[str, RlTask] = {
     "mobile-easy": _mobile(600_000, 50, difficulty="easy"),
     "mobile-hard": _mobile(1_500_000, 13, difficulty="hard"),
     "craft": RlTask(
-        "RBL/MobileAnchors-v0", {"scenes": CRAFT}, 2_500_000, 20, algorithm="set-ppo",
-        gamma=0.95, gae_lambda=0.9, num_envs=128,
+        "RBL/MobileAnchors-v0", {"scenes": CRAFT},
+        Training(2_500_000, 20, 0.95, 0.9, num_envs=128, algorithm="set-ppo"),
     ),
     "selection": _selection(k=3),
     "selection-priced": _selection(mode="priced"),
     "halls": RlTask(
-        "RBL/AnchorSelection-v0", {"k": 3, "scenes": HALLS}, 160_000, 13,
-        algorithm="supervised", gamma=0.8, gae_lambda=0.9, num_envs=256,
+        "RBL/AnchorSelection-v0", {"k": 3, "scenes": HALLS},
+        Training(160_000, 13, 0.8, 0.9, num_envs=256, algorithm="supervised"),
     ),
 }  # fmt: skip
 
@@ -201,4 +214,4 @@ def task_of(given: Any) -> RlTask:
             "do in the policy what the wrappers do"
         )
     kept = {key: value for key, value in spec.kwargs.items() if key not in _OF_FORM}
-    return RlTask(spec.id, kept, steps=1, rollout=1)
+    return RlTask(spec.id, kept)

@@ -15,7 +15,7 @@ import numpy as np
 from rbl_gym.checks import check_one_of
 from rbl_gym.extras import require
 from rbl_gym.studies.learning.policies import AnyPolicy, Policy, kind_and_outputs
-from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
+from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask, Training
 from rbl_gym.studies.learning.sb3_models import policy_of
 from rbl_gym.studies.learning.set_policies import SetPolicy
 
@@ -107,7 +107,7 @@ def check_training(task: RlTask, seed: int, algorithm: str | None = None) -> str
             f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the worlds of larger "
             "seeds are held out for evaluations"
         )
-    algorithm = check_one_of("algorithm", algorithm or task.algorithm, list(ALGORITHMS))
+    algorithm = check_one_of("algorithm", algorithm or task.training.algorithm, list(ALGORITHMS))
     _check_goes_with(algorithm, task)
     libraries = ["torch"]
     if algorithm not in _TAUGHT:
@@ -167,13 +167,14 @@ def _explored(
 
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
-    envs = _Timed(Sb3VecEnv(task.make(task.num_envs)))
-    model = _model(algorithm, task, envs.venv, seed)
-    if task.gamma < 1:
+    settings = task.training
+    envs = _Timed(Sb3VecEnv(task.make(settings.num_envs)))
+    model = _model(algorithm, settings, envs.venv, seed)
+    if settings.gamma < 1:
         # Rewards without an end have a sum far from zero. A critic that starts at this value learns
         # the differences, which matter, from the first update on.
         with torch.no_grad():
-            model.policy.value_net.bias.fill_(_mean_reward(task, seed) / (1 - task.gamma))
+            model.policy.value_net.bias.fill_(_mean_reward(task, seed) / (1 - settings.gamma))
     # Seed again after PPO, whose own seeds overlap between neighbouring trainings.
     envs.venv.seed(seed * SEED_STRIDE)
     curve, cpu = _Curve(advance), time.process_time()
@@ -183,12 +184,12 @@ def _explored(
     return lambda meta: policy._replace(meta=meta), figures
 
 
-def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
-    """Return the algorithm of stable-baselines3 or sb3-contrib, configured for the task."""
+def _model(algorithm: str, settings: Training, envs: Any, seed: int) -> Any:
+    """Return the algorithm of stable-baselines3 or sb3-contrib with these settings."""
     kind = kind_and_outputs(envs.action_space)[0]
-    network: dict[str, Any] = {"net_arch": list(task.hidden)}
+    network: dict[str, Any] = {"net_arch": list(settings.hidden)}
     if kind == "box":
-        network["log_std_init"] = task.log_std_init
+        network["log_std_init"] = settings.log_std_init
     policy = "MlpPolicy"
     if algorithm == "maskable-ppo":
         from sb3_contrib import MaskablePPO  # pyright: ignore[reportMissingImports]
@@ -209,12 +210,12 @@ def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
         return form(
             policy,
             envs,
-            n_steps=task.rollout,
-            batch_size=task.batch_size,
-            n_epochs=task.epochs,
-            gamma=task.gamma,
-            gae_lambda=task.gae_lambda,
-            learning_rate=lambda remaining: task.learning_rate * remaining,
+            n_steps=settings.rollout,
+            batch_size=settings.batch_size,
+            n_epochs=settings.epochs,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            learning_rate=lambda remaining: settings.learning_rate * remaining,
             policy_kwargs=network,
             seed=seed,
             device="cpu",
@@ -226,7 +227,8 @@ def _mean_reward(task: RlTask, seed: int) -> float:
     envs = task.make(16)
     envs.reset(seed=seed * SEED_STRIDE)
     envs.action_space.seed(seed)
-    return float(np.mean([envs.step(envs.action_space.sample())[1] for _ in range(task.rollout)]))
+    steps = range(task.training.rollout)
+    return float(np.mean([envs.step(envs.action_space.sample())[1] for _ in steps]))
 
 
 class _Timed:
