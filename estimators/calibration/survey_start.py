@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.calibration.survey import SurveyState
@@ -22,6 +23,8 @@ def start_from_anchors(
 ) -> SurveyState:
     """Estimate poses from approximate anchors: tags from squared ranges, the body from its tags.
 
+    An epoch without any tag has its tags' centre at 0, and no rotation.
+
     Parameters
     ----------
     ranges, links
@@ -37,7 +40,7 @@ def start_from_anchors(
     K, N = points.shape[:2]
     if planar:
         points[..., 2] = height_m + tags[:, 2]
-    told = np.isfinite(points).min(axis=-1).astype(bool)
+    told = np.isfinite(points).all(axis=-1)
     points = np.where(told[..., None], points, np.nan)
     centre = np.nanmean(np.where(told.any(axis=1)[:, None, None], points, 0.0), axis=1)
     rotation = np.broadcast_to(np.eye(3), (K, 3, 3)).copy()
@@ -146,21 +149,19 @@ def anchors_from_pairs(pairs: FloatArray, bias_m: float = 0.0, planar: bool = Fa
     ValueError
         If there are groups of anchors without ranges between them.
     """
-    from scipy.sparse.csgraph import shortest_path
-
     d = np.maximum(pairs, pairs.T)
     d = np.where(d > 0, np.maximum(d - bias_m, 1e-3), 0.0)
-    d = shortest_path(d, directed=False)
+    d = scipy.sparse.csgraph.shortest_path(d, directed=False)
     if not np.isfinite(d).all():
         far = np.flatnonzero(~np.isfinite(d[0])).tolist()
         raise ValueError(
             "pairs must connect all anchors, but no chain of ranges joins anchor 0 to the anchors "
             f"{far}"
         )
-    M, D = len(d), 2 if planar else 3
+    M = len(d)
+    D = min(M, 2 if planar else 3)
     J = np.eye(M) - 1 / M
     values, vectors = np.linalg.eigh(-0.5 * J @ d**2 @ J)
     anchors = np.zeros((M, 3))
-    D = min(D, M)
     anchors[:, :D] = vectors[:, -D:] * np.sqrt(np.maximum(values[-D:], 0.0))
     return anchors

@@ -1,4 +1,4 @@
-"""Compute Cramer-Rao bounds for links that are lost or take a reflected path.
+"""Compute Cramer-Rao bounds for unreliable links: lost, or over a reflected path.
 
 Shapes, the pose error (w, v) and the order of the 6 x 6 matrices are those of `bounds`. A random
 path is a mixture of densities, whose information about the range is an integral.

@@ -32,6 +32,7 @@ from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Walls
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
+from rbl_gym.placement.racks import RACK_UNIFORMS, drawn_racks, limits_of_racks
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
@@ -52,10 +53,8 @@ _POSE_SEED = 20130821
 # Range of the work region's half size as a fraction of the volume's, (x, y, z).
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 _SPAN = _MOST - _LEAST
-# Numbers of uniforms of a context: 6 for the region, 6 for each rack.
-_REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
-# Indices of a rack's centre and half sizes in `PlacementTask.rack_limits`.
-_LONG_X, _LONG_Y = np.array([0, 1, 5, 3, 2, 5]), np.array([0, 1, 5, 2, 3, 5])
+# Number of uniforms of a work region.
+_REGION_UNIFORMS = 6
 
 
 class Context(NamedTuple):
@@ -147,11 +146,9 @@ class PlacementTask:
 
     @functools.cached_property
     def rack_limits(self) -> tuple[FloatArray, FloatArray]:
-        """Return minimum and span (6,) of a rack: x, y, half width and length, 0, half height."""
-        low, high = self.scene.anchor_region.bounds()
-        x, y, _ = high - low
-        least = np.array([low[0] + 0.15 * x, low[1] + 0.15 * y, 0.2, 1.0, 0.0, 0.6])
-        return _read_only(least), _read_only(np.array([0.7 * x, 0.7 * y, 0.2, 1.0, 0.0, 0.6]))
+        """`limits_of_racks` of the anchor region."""
+        least, span = limits_of_racks(*self.scene.anchor_region.bounds())
+        return _read_only(least), _read_only(span)
 
     @functools.cached_property
     def prior_information(self) -> FloatArray:
@@ -187,7 +184,7 @@ def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0)
 
 def context_uniforms(task: PlacementTask) -> int:
     """Return the number of uniforms of a context."""
-    return _REGION_UNIFORMS + _RACK_UNIFORMS * task.racks
+    return _REGION_UNIFORMS + RACK_UNIFORMS * task.racks
 
 
 def draw_contexts(
@@ -204,21 +201,13 @@ def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
     least = low + half
     centre = least + uniforms[..., 3:6] * ((high - half) - least)
     of_racks = uniforms[..., _REGION_UNIFORMS:]
-    of_racks = of_racks.reshape((*uniforms.shape[:-1], task.racks, _RACK_UNIFORMS))
-    drawn = _racks(task, of_racks) if task.racks else of_racks
+    of_racks = of_racks.reshape((*uniforms.shape[:-1], task.racks, RACK_UNIFORMS))
+    drawn = drawn_racks(task.rack_limits, of_racks) if task.racks else of_racks
     own = task.scene.obstruction.boxes
     if not len(own):
         return Context(centre, half, drawn)
     own = np.broadcast_to(own, (*uniforms.shape[:-1], *own.shape))
     return Context(centre, half, np.concatenate([own, drawn], axis=-2))
-
-
-def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
-    """Return racks (..., K, 6) on the floor, in the central 70 % of the room, long in x or in y."""
-    least, span = task.rack_limits
-    drawn = least + span * uniforms
-    along_x = uniforms[..., 4:5] < 0.5
-    return np.where(along_x, drawn[..., _LONG_X], drawn[..., _LONG_Y])
 
 
 def whole_volume(task: PlacementTask) -> Context:

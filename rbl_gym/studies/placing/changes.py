@@ -1,4 +1,4 @@
-"""Figures of a layout after one change: an anchor more, or one moved out of a common plane."""
+"""Figures of a layout after one change: with one more anchor, or one moved out of the plane."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from rbl_gym.studies.placing.ranking import overall_score
 def with_next(
     problem: Problem, anchors: FloatArray, judged: list[Judged], seed: int, survive: int
 ) -> dict[str, Any] | None:
-    """Return the best position of one more anchor, and the accuracy with it."""
+    """Return the best position of one more anchor, and the accuracy with it.
+
+    With `survive` 1, any one of the anchors may be missing.
+    """
     place = next_anchor(problem, anchors, seed, survive)
     if place is None:
         return None

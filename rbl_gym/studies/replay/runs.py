@@ -96,7 +96,8 @@ def _joined(found: list[TrackErrors]) -> TrackErrors:
         return np.concatenate(known) if len(known) == len(arrays) else None
 
     freedom = np.concatenate([np.full(len(e.known), e.freedom) for e in found])
-    # Scale the NEES of runs with fewer compared components to the same number.
+    # NEES of fewer compared components are scaled to the mean of the most. They are no longer
+    # chi-square: only their mean (ANEES) is used.
     most = int(freedom.max())
     return TrackErrors(
         np.concatenate([e.known for e in found]),

@@ -19,7 +19,8 @@ class Odometry:
     Parameters
     ----------
     odometry_m, slip_m, odometry_deg
-        Standard deviation of dead reckoning after 1 s: forwards; sideways and vertical; rotation.
+        Standard deviations of the error of dead reckoning after 1 s: forwards, sideways and
+        vertically, and of the rotation.
     odometry_scale
         Standard deviation of the scale errors of speeds and turn rates, which are estimated.
     odometry_bias_deg_s
@@ -63,6 +64,9 @@ class Odometry:
 class Inertial:
     """Error model and clock of the inertial sensor of a recording.
 
+    Its biases are 0.01 rad/s and 0.06 m/s^2 at the start, and wander by 1e-4 rad/s/sqrt(s) and
+    2e-3 m/s^2/sqrt(s) (standard deviations).
+
     Parameters
     ----------
     gyro_noise, accel_noise
@@ -72,8 +76,8 @@ class Inertial:
     gravity_tilt_deg
         Standard deviation of the angle between the world z axis and the vertical.
     recorded_share
-        The share of the range standard deviations of a recording that is white noise. The rest is
-        lasting biases, which the filter estimates.
+        The standard deviations of the ranges in a recording are multiplied by this factor, to that
+        of the white noise. The rest of the errors are lasting biases, which the filter estimates.
     imu_offset_s
         How far its clock is ahead of that of the ranges, seconds.
     """
