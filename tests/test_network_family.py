@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from rbl_gym.envs.network_plans import PRIOR_STD_RAD, NetworkFamily, NetworkPlan
 from rbl_gym.networks.bounds import linked_covariance, linked_pose_covariance
-from rbl_gym.worlds import laws
+from rbl_gym.worlds import field_laws
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from tests.helpers import assert_same
 
@@ -109,8 +109,8 @@ def test_the_checker_and_frames():
 def test_largest_numbers_are_those_of_the_spaces():
     family = NetworkFamily(tuple(DRAWN), NetworkPlan())
     assert (family.highest.n_nodes, family.highest.radius_m, family.highest.side_m) == (7, 8, 30)
-    assert laws.limits({"choice": [3.0, {"uniform": [1.0, 9.0]}, 2]}) == (1.0, 9.0)
-    assert laws.limits(4) == (4, 4)
+    assert field_laws.limits({"choice": [3.0, {"uniform": [1.0, 9.0]}, 2]}) == (1.0, 9.0)
+    assert field_laws.limits(4) == (4, 4)
     space: Any = gym.make(ID, scenes=DRAWN).observation_space
     assert space["bearings"].shape == (7, 7)
 

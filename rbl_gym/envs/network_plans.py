@@ -13,7 +13,7 @@ import numpy as np
 
 from rbl_gym.checks import check_count, check_number, did_you_mean
 from rbl_gym.networks.bounds import Sensing
-from rbl_gym.worlds import laws
+from rbl_gym.worlds import field_laws
 
 __all__ = ["NetworkFamily", "NetworkPlan"]
 
@@ -157,17 +157,22 @@ class NetworkFamily:
                         f"scenes[{index}] must only have the fields {', '.join(_NAMES)}, "
                         f"got {name!r:.80}{did_you_mean(name, _NAMES)}"
                     )
-            for one in laws.corners(member, f"scenes[{index}]"):
+            for one in field_laws.corners(member, f"scenes[{index}]"):
                 self._made(index, one)
             for extreme in (0, 1):
                 # Both ends of all laws must be networks too.
-                self._made(index, {key: laws.limits(one)[extreme] for key, one in member.items()})
+                self._made(
+                    index, {key: field_laws.limits(one)[extreme] for key, one in member.items()}
+                )
 
     @functools.cached_property
     def highest(self) -> NetworkPlan:
         """The largest value of every field."""
         ends = [
-            {**dataclasses.asdict(self.plan), **{k: laws.limits(v)[1] for k, v in one.items()}}
+            {
+                **dataclasses.asdict(self.plan),
+                **{k: field_laws.limits(v)[1] for k, v in one.items()},
+            }
             for one in self.members
         ]
         return NetworkPlan(**{name: max(end[name] for end in ends) for name in _NAMES})
@@ -175,7 +180,7 @@ class NetworkFamily:
     def draw(self, rng: np.random.Generator) -> tuple[NetworkPlan, dict[str, Any]]:
         """Draw a network; return it with the fields of its member."""
         index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
-        member = laws.draw(self.members[index], rng)
+        member = field_laws.draw(self.members[index], rng)
         return self._made(index, member), dict(member)
 
     def _made(self, index: int, member: Mapping[str, Any]) -> NetworkPlan:

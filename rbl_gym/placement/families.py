@@ -23,7 +23,7 @@ from rbl_gym.placement.problem import (
     root_of,
     task,
 )
-from rbl_gym.worlds import laws, scenes
+from rbl_gym.worlds import field_laws, scenes
 from rbl_gym.worlds.families import members_of, padded
 
 __all__ = ["TaskFamily", "described"]
@@ -60,7 +60,9 @@ class TaskFamily:
         """Tasks with all choices and both ends of all integers; other numbers are midpoints."""
         found: list[PlacementTask] = []
         for index, member in enumerate(self.members):
-            found += [self._made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
+            found += [
+                self._made(index, one) for one in field_laws.corners(member, f"scenes[{index}]")
+            ]
         return tuple(found)
 
     @property
@@ -68,7 +70,9 @@ class TaskFamily:
         """For each member a task with the fewest anchors."""
         found = []
         for index, member in enumerate(self.members):
-            made = [self._made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
+            made = [
+                self._made(index, one) for one in field_laws.corners(member, f"scenes[{index}]")
+            ]
             found.append(min(made, key=lambda one: one.n_anchors))
         return tuple(found)
 
@@ -90,7 +94,7 @@ class TaskFamily:
     def draw(self, rng: np.random.Generator) -> tuple[PlacementTask, dict[str, Any]]:
         """Draw a task; return it with its overrides."""
         index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
-        member = laws.draw(self.members[index], rng)
+        member = field_laws.draw(self.members[index], rng)
         made = self._made(index, member)
         told = dict(member) if isinstance(member, Mapping) else {"name": made.scene.name}
         return made, {**told, "n_anchors": made.n_anchors, "racks": made.racks}

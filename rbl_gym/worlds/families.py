@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.worlds import laws, scenes
+from rbl_gym.worlds import field_laws, scenes
 from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SceneFamily", "family"]
@@ -68,7 +68,7 @@ class SceneFamily:
         """Scenes with all choices and both ends of all integers; other numbers are midpoints."""
         found: list[Scene] = []
         for index, member in enumerate(self.members):
-            found += [_made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
+            found += [_made(index, one) for one in field_laws.corners(member, f"scenes[{index}]")]
         return tuple(found)
 
     @functools.cached_property
@@ -140,7 +140,7 @@ class SceneFamily:
         """
         if index is None:
             index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
-        member = laws.draw(self.members[index], rng)
+        member = field_laws.draw(self.members[index], rng)
         scene = _made(index, member)
         return scene, dict(member) if isinstance(member, Mapping) else {"name": scene.name}
 
