@@ -7,6 +7,7 @@ import functools
 import graphlib
 import importlib
 import json
+import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -138,6 +139,36 @@ def test_packages_import_each_other_without_a_circle():
             if package_of(name) != package_of(imported) and imported.count("."):
                 boxes.add(package_of(name), package_of(imported))
     boxes.prepare()  # raises CycleError, which names the circle
+
+
+def rows_of_the_table() -> list[list[str]]:
+    """The files and folders in each row of the table of packages in docs/development.md."""
+    page = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
+    table = page.split("\n| package | content |\n|---|---|\n")[1].split("\n\n")[0]
+    rows = [re.findall("`([^`]+)`", line.split("|")[1]) for line in table.splitlines()]
+    return [[first, *(str(Path(first).parent / one) for one in more)] for first, *more in rows]
+
+
+def test_packages_import_only_from_those_above_them_in_the_table():
+    rows = rows_of_the_table()
+    places = {}
+    for name, file in MODULES.items():
+        path = file.relative_to(ROOT).as_posix()
+        found = [
+            row
+            for row, parts in enumerate(rows)
+            for one in parts
+            if path == one or (one.endswith("/") and path.startswith(one))
+        ]
+        assert len(found) == 1 or name == "rbl_gym", f"docs/development.md, rows of {path}: {found}"
+        places[name] = found[0] if found else -1
+    below = [
+        f"{name} imports {imported}"
+        for name in MODULES
+        for imported in imports(name) & set(MODULES)
+        if places[imported] > places[name] >= 0
+    ]
+    assert below == []
 
 
 def test_modules_import_each_other_without_a_circle():

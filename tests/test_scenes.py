@@ -1,4 +1,4 @@
-"""Scenes: the values of the table in the design, overrides from plain dicts, and errors."""
+"""Scenes: the values of a table, overrides from plain dicts, and errors."""
 
 from __future__ import annotations
 
@@ -23,47 +23,48 @@ from rbl_gym.worlds.scene import Scene
 
 every_scene = pytest.mark.parametrize("name", scenes.SCENES)
 
-# The table of the design: process (m, degrees) of one step, initial uncertainty (degrees, m).
+# The figures of the scenes, written a second time. Process noise of one step, and initial
+# uncertainty, in (m, degrees). `camsap2013` and `icassp2013` are from papers, the others our own.
 TABLE: dict[str, dict[str, Any]] = {
     "uwb_room": {
         "volume": Box((1, 1, 0.5), (9, 7, 2.2)), "anchor_region": Walls((0, 0, 0.3), (10, 8, 3)),
         "n_anchors": 6, "noise": RangeNoise(0.10, 0.0), "body": ("octahedron", 0.8), "dt": 0.1,
         "anchor_speed_m_s": 0.0, "speed_m_s": 1.0, "spin_rad_s": 0.29, "process": (0.03, 1.5),
-        "initial": (10, 0.5), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "initial": (0.5, 10), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
     },
     "drone_yard": {
         "volume": Box((-50, -50, 5), (50, 50, 40)),
         "anchor_region": Box((-60, -60, 0), (60, 60, 6)),
         "n_anchors": 6, "noise": RangeNoise(0.10, 0.001), "body": ("octahedron", 1), "dt": 0.1,
         "anchor_speed_m_s": 0.0, "speed_m_s": 5.0, "spin_rad_s": 0.29, "process": (0.1, 1.5),
-        "initial": (10, 1.0), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "initial": (1.0, 10), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
     },
     "auv_buoys": {
         "volume": Box((-150, -150, -80), (150, 150, -20)),
         "anchor_region": Box((-200, -200, 0), (200, 200, 0)),
         "n_anchors": 4, "noise": RangeNoise(0.05, 0.001), "body": ("pyramid", 2), "dt": 1.0,
         "anchor_speed_m_s": 4.0, "speed_m_s": 1.5, "spin_rad_s": 0.03, "process": (0.3, 2.0),
-        "initial": (10, 3.0), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "initial": (3.0, 10), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
     },
     "satellite": {
         "volume": Box((-5, -5, -5), (5, 5, 5)), "anchor_region": Shell(50, 300),
         "n_anchors": 5, "noise": RangeNoise(0.02, 0.0002), "body": ("octahedron", 2), "dt": 1.0,
         "anchor_speed_m_s": 1.0, "speed_m_s": 0.05, "spin_rad_s": 0.012, "process": (0.02, 1.0),
-        "initial": (5, 0.5), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "initial": (0.5, 5), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
     },
     "auv_craft": {
         "volume": Box((-150, -150, -80), (150, 150, -20)),
         "start_volume": Box((-100, -100, -80), (100, 100, -20)), "anchor_start_m": 150.0,
         "n_anchors": 3, "noise": RangeNoise(0.05, 0.002), "body": ("pyramid", 2), "dt": 2.0,
         "anchor_speed_m_s": 4.0, "speed_m_s": 1.5, "spin_rad_s": 0.03, "process": (0.3, 2.0),
-        "initial": (10, 3.0), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "initial": (3.0, 10), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
     },
     "hall": {
         "volume": Box((-17, -8, 0.5), (17, 8, 3)),
         "anchor_region": Walls((-20, -10, 0), (20, 10, 6)), "n_anchors": 12,
         "noise": RangeNoise(0.10, 0.005), "body": ("octahedron", 0.8), "dt": 0.2,
         "anchor_speed_m_s": 0.0, "speed_m_s": 2.0, "spin_rad_s": 0.2, "process": (0.05, 2.0),
-        "initial": (10, 0.5), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "initial": (0.5, 10), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
         "blocked_information": 0.02,
     },
     "camsap2013": {
@@ -71,7 +72,7 @@ TABLE: dict[str, dict[str, Any]] = {
         "noise": SquaredRangeNoise(0.0316), "body": ("pyramid", 1), "dt": 1.0, "steps": 20,
         "anchor_speed_m_s": 0.0, "process": (1.0, 0.1), "trajectory": "constant", "prior": "start",
         # P0 = 100 I12 is pose information .02 and .01, that is variances 50 and 100.
-        "initial": (np.rad2deg(50**0.5), 10.0),
+        "initial": (10.0, np.rad2deg(50**0.5)),
     },
     "icassp2013": {
         "anchor_region": Box((0, 0, 0), (100, 100, 100)), "n_anchors": 10, "anchors": None,
@@ -96,7 +97,7 @@ def test_scene_has_the_figures_of_the_table(name):
     step = np.sqrt(np.diagonal(scene.process.covariance(np.zeros(6), scene.dt)))
     np.testing.assert_allclose(step, [np.deg2rad(degrees)] * 3 + [metres] * 3, rtol=1e-12)
     if "initial" in want:
-        degrees, metres = want.pop("initial")
+        metres, degrees = want.pop("initial")
         std = np.array([np.deg2rad(degrees)] * 3 + [metres] * 3)
         np.testing.assert_allclose(scene.prior_covariance, np.diag(std**2), rtol=1e-12)
     if "body" in want:
