@@ -58,7 +58,7 @@ def test_selection_actions_are_legal_and_follow_the_generator(arguments, name):
         elif isinstance(env.single_action_space, gym.spaces.Discrete):
             scores = AnchorSelectionVectorEnv(4, k=2)
             scores.reset(seed=1)
-            if env.seen is not None and not env.seen["links"].any():
+            if env.inner_observation is not None and not env.inner_observation["links"].any():
                 chosen = scores._command(controller(scores, np.random.default_rng(7)))
                 np.testing.assert_array_equal(env._command(actions), chosen)
         else:
@@ -257,13 +257,15 @@ def test_craft_of_each_world_go_where_they_would_alone(name):
     for rows, situation in situations(env):
         m = situation.scene.n_anchors
         assert {env.world.scenes[row] for row in rows} == {situation.scene}
-        assert env.seen is not None
+        assert env.inner_observation is not None
         for row in rows:
             found[row] = m
             alone = MobileAnchorsVectorEnv(1, scene=situation.scene)
             alone.reset(seed=0)
-            alone.seen = {key: value[row : row + 1].copy() for key, value in env.seen.items()}
-            alone.seen["anchors"] = alone.seen["anchors"][:, :m]
+            alone.inner_observation = {
+                key: value[row : row + 1].copy() for key, value in env.inner_observation.items()
+            }
+            alone.inner_observation["anchors"] = alone.inner_observation["anchors"][:, :m]
             alone.order = env.order[row : row + 1, :m]
             wanted = controllers.MOBILE[name](alone, np.random.default_rng(0))[0]
             np.testing.assert_allclose(actions[row, : 2 * m], wanted, atol=1e-12)

@@ -224,7 +224,7 @@ def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_p
 
 
 def test_evaluations_and_trainings_never_share_worlds():
-    assert max(task.num_envs for task in TASKS.values()) <= SEED_STRIDE
+    assert max(task.training.num_envs for task in TASKS.values()) <= SEED_STRIDE
     with pytest.raises(ValueError, match="seed must be below 1000, got 1000"):
         training.train("auv_buoys", rl_task("auv_buoys"), 64, 1000, lambda _: None)
     first, second = (

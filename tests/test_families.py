@@ -346,7 +346,10 @@ def test_craft_that_are_not_there_are_zeros():
             "rbl_gym:RBL/MobileAnchors-v0", scene={**CRAFT[0], "n_anchors": m}
         ).unwrapped
         # The same view of the same belief and craft.
-        told = {**env.unwrapped.seen, "anchors": env.unwrapped.seen["anchors"][:m]}
+        told = {
+            **env.unwrapped.inner_observation,
+            "anchors": env.unwrapped.inner_observation["anchors"][:m],
+        }
         told.pop("anchor_mask")
         own = alone._show(told, alone.scene)
         np.testing.assert_array_equal(flat[15 : 15 + 2 * m], own[15 : 15 + 2 * m])
@@ -367,7 +370,7 @@ def test_the_selection_shows_the_drawn_hall_and_what_was_learned():
         low, high = scene.volume.bounds()
         for _ in range(scene.steps):
             flat, *_, info = env.step(rng.uniform(-1, 1, 12).astype(np.float32))
-            seen = env.unwrapped.seen
+            seen = env.unwrapped.inner_observation
             age += 1
             for k in np.flatnonzero(info["chosen"]):
                 assert k < m
