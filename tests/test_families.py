@@ -351,7 +351,7 @@ def test_craft_that_are_not_there_are_zeros():
             "anchors": env.unwrapped.inner_observation["anchors"][:m],
         }
         told.pop("anchor_mask")
-        own = alone._show(told, alone.scene)
+        own = alone._task_view(told, alone.scene)
         np.testing.assert_array_equal(flat[15 : 15 + 2 * m], own[15 : 15 + 2 * m])
         np.testing.assert_array_equal(flat[25 : 25 + m], own[15 + 2 * m :])
     assert seen == {2, 3, 4, 5}

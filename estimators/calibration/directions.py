@@ -264,6 +264,15 @@ class _Told(NamedTuple):
     tilt_std_rad: float
 
 
+class _Log(NamedTuple):
+    ranges: FloatArray  # (K, M, N)
+    mask: BoolArray
+    anchors: FloatArray
+    tags: FloatArray
+    model: DirectionModel
+    level: _Told
+
+
 class _Found(NamedTuple):
     cost: FloatArray  # (H, K)
     residual: FloatArray  # (H, K, M, N) over the standard deviation
@@ -311,14 +320,14 @@ def locate_by_directions(
         )
     rotation, translation = _starts(ranges, mask, anchors, level.height_m)
     told = _Told(level.height_m, level.height_std_m, level.tilt_std_rad)
-    data = (ranges, mask, anchors, tags, model, told)
-    now = _cost(*data, rotation, translation)
+    log = _Log(ranges, mask, anchors, tags, model, told)
+    now = _cost(log, rotation, translation)
     damping = np.full(now.cost.shape, 1e-2)
     for _ in range(_ITERATIONS):
-        step = _step(*data, rotation, translation, now, damping)
+        step = _step(log, rotation, translation, now, damping)
         turned = rotations.exp(step[..., :3]) @ rotation
         moved = translation + step[..., 3:]
-        new = _cost(*data, turned, moved)
+        new = _cost(log, turned, moved)
         better = new.cost < now.cost
         rotation = np.where(better[..., None, None], turned, rotation)
         translation = np.where(better[..., None], moved, translation)
@@ -357,34 +366,33 @@ def _starts(
     )
 
 
-def _cost(
-    ranges: FloatArray, mask: BoolArray, anchors: FloatArray, tags: FloatArray,
-    model: DirectionModel, level: _Told, rotation: FloatArray, translation: FloatArray,
-) -> _Found:  # fmt: skip
+def _cost(log: _Log, rotation: FloatArray, translation: FloatArray) -> _Found:
+    anchors, tags, level = log.anchors, log.tags, log.level
     d = _rays(rotation, translation, anchors, tags)[1]
-    bias, std = direction_model_at(model, rotation, translation, anchors, tags)
-    z = np.where(mask, (ranges - d - bias) / std, 0.0)
-    cost = (_late_loss(z)[0] + np.where(mask, np.log(std), 0.0)).sum(axis=(-2, -1))
+    bias, std = direction_model_at(log.model, rotation, translation, anchors, tags)
+    z = np.where(log.mask, (log.ranges - d - bias) / std, 0.0)
+    cost = (_late_loss(z)[0] + np.where(log.mask, np.log(std), 0.0)).sum(axis=(-2, -1))
     height = (translation[..., 2] - level.height_m) / level.height_std_m
     tilt = (rotation[..., :2, 2] ** 2).sum(axis=-1) / level.tilt_std_rad**2
     return _Found(cost + 0.5 * (height**2 + tilt), z, std, bias)
 
 
 def _step(
-    ranges: FloatArray, mask: BoolArray, anchors: FloatArray, tags: FloatArray,
-    model: DirectionModel, level: _Told, rotation: FloatArray, translation: FloatArray,
-    now: _Found, damping: FloatArray,
-) -> FloatArray:  # fmt: skip
+    log: _Log, rotation: FloatArray, translation: FloatArray, now: _Found, damping: FloatArray
+) -> FloatArray:
     """Return steps (H, K, 6) of the pose error."""
+    anchors, tags, level = log.anchors, log.tags, log.level
     u, _ = _rays(rotation, translation, anchors, tags)
     arms = tags @ np.swapaxes(rotation, -1, -2)
     J = np.concatenate([np.cross(arms[..., None, :, :], u), u], axis=-1)
     for i, axis in enumerate(np.eye(6)):
         turned = rotations.exp(_STEP * axis[:3]) @ rotation
         moved = translation + _STEP * axis[3:]
-        J[..., i] += (direction_model_at(model, turned, moved, anchors, tags)[0] - now.bias) / _STEP
+        J[..., i] += (
+            direction_model_at(log.model, turned, moved, anchors, tags)[0] - now.bias
+        ) / _STEP
     z = now.residual
-    weight = mask * np.where(z > 0, 1 / (1 + 0.5 * z * z), 1.0) / now.std**2
+    weight = log.mask * np.where(z > 0, 1 / (1 + 0.5 * z * z), 1.0) / now.std**2
     weighted = weight[..., None] * J
     H = np.einsum("...mni,...mnj->...ij", weighted, J)
     g = np.einsum("...mni,...mn->...i", weighted, z * now.std)
