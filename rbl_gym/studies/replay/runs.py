@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,11 +59,12 @@ def replay_runs(
     if not recordings:
         raise ValueError("recordings must hold a run, got none")
     for run, recording in recordings.items():
-        _named(run, lambda recording=recording: check_replay(recording, settings))
-    replayed = {
-        run: _named(run, lambda log=recording: replay_recording(log, settings, advance))
-        for run, recording in recordings.items()
-    }
+        with _errors_of(run):
+            check_replay(recording, settings)
+    replayed: dict[str, Replayed] = {}
+    for run, recording in recordings.items():
+        with _errors_of(run):
+            replayed[run] = replay_recording(recording, settings, advance)
     every = [one.figures for one in replayed.values()]
     together: dict[str, Any] = {
         name: sum(one[name] for one in every) for name in ("epochs", "links", "duration_s")
@@ -81,9 +83,11 @@ def replay_runs(
     return ReplayedRuns(replayed, {"runs": figures, "together": together})
 
 
-def _named(run: str, work: Callable[[], Any]) -> Any:
+@contextlib.contextmanager
+def _errors_of(run: str) -> Iterator[None]:
+    """Put the name of the run before the message of a ValueError."""
     try:
-        return work()
+        yield
     except ValueError as error:
         raise ValueError(f"run {run!r}: {error}") from error
 

@@ -40,23 +40,22 @@ class Odometry:
     headings: int = 12
 
     def __post_init__(self) -> None:
-        check_number("odometry_offset_s", self.odometry_offset_s)
-        check_count("headings", self.headings)
-        self.sensor()
-
-    def sensor(self) -> OdometrySensor:
-        """Return the error model of its readings."""
         for name in ("odometry_m", "slip_m", "odometry_deg"):
             check_number(name, getattr(self, name), low=1e-6)
         for name in ("odometry_scale", "odometry_bias_deg_s"):
             check_number(name, getattr(self, name), low=0.0)
+        check_number("odometry_offset_s", self.odometry_offset_s)
+        check_count("headings", self.headings)
+
+    def sensor(self) -> OdometrySensor:
+        """Return the error model of its readings."""
         return OdometrySensor(
-            self.odometry_m,
-            self.slip_m,
-            math.radians(self.odometry_deg),
-            self.odometry_scale,
-            self.odometry_scale,
-            math.radians(self.odometry_bias_deg_s),
+            speed_noise=self.odometry_m,
+            slip_noise=self.slip_m,
+            turn_noise=math.radians(self.odometry_deg),
+            speed_scale_std=self.odometry_scale,
+            turn_scale_std=self.odometry_scale,
+            turn_bias_rad_s=math.radians(self.odometry_bias_deg_s),
         )
 
 
@@ -92,7 +91,7 @@ class Inertial:
         check_number("imu_offset_s", self.imu_offset_s)
         check_number("gravity_tilt_deg", self.gravity_tilt_deg, low=0.0, high=20.0)
         check_number("recorded_share", self.recorded_share, low=1e-3)
-        self.sensor()
+        self.sensor()  # checks the densities
 
     def sensor(self) -> InertialSensor:
         """Return the error model of its readings."""
