@@ -19,7 +19,7 @@ from rbl_gym.estimators.calibration.link_equations import (
 )
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings import truth_at
+from rbl_gym.recordings import Truth, truth_at
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
@@ -90,29 +90,40 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
 
 def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, BoolArray]:
     """Return the path at the times of the ranges, for a clock offset of the truth, and its mask."""
-    rotation, translation, known = [], [], []
-    for run in log.runs:
-        truth = run.truth
-        assert truth is not None
-        Q, p, ok = truth_at(truth, run.times + shift, settings.truth_gap_s)
-        still = truth.times[-1] - truth.times[0] > 0 and not np.ptp(truth.translation, axis=0).any()
-        if still and (truth.rotation is None or not np.ptp(truth.rotation, axis=0).any()):
-            # A body at rest is also at rest in gaps of its truth, and shortly before and after.
-            early, late = truth.times[0] - _SEARCH_S, truth.times[-1] + _SEARCH_S
-            ok = (run.times + shift >= early) & (run.times + shift <= late)
-        Q = np.broadcast_to(np.eye(3), (len(p), 3, 3)) if Q is None else Q
-        if settings.planar:
-            Q = rotations.exp(rotations.yaw(Q)[:, None] * np.array([0.0, 0.0, 1.0]))
-        if truth.planar:
-            p = p.copy()
-            offset = settings.height_offset_m or 0.0
-            below = run.anchors_by_epoch[..., 2].mean(axis=-1) - offset - log.tags[:, 2].mean()
-            p[:, 2] = below if settings.height_m is None else settings.height_m
-        rotation.append(Q)
-        translation.append(p)
-        known.append(ok)
-    path = KnownPath(log.times, np.concatenate(rotation), np.concatenate(translation))
-    return path, np.concatenate(known)
+    runs = [_run_at(run, log.tags, settings, shift) for run in log.runs]
+    rotation, translation, known = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+    return KnownPath(log.times, rotation, translation), known
+
+
+def _run_at(
+    run: Recording, tags: FloatArray, settings: LinkSettings, shift: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return rotation, translation and mask of one run, for `path_at`."""
+    truth, times = run.truth, run.times + shift
+    assert truth is not None
+    rotation, translation, known = truth_at(truth, times, settings.truth_gap_s)
+    if _rests(truth):
+        # A body at rest is also at rest in gaps of its truth, and shortly before and after.
+        known = (times >= truth.times[0] - _SEARCH_S) & (times <= truth.times[-1] + _SEARCH_S)
+    if rotation is None:
+        rotation = np.broadcast_to(np.eye(3), (len(times), 3, 3))
+    if settings.planar:
+        rotation = rotations.exp(rotations.yaw(rotation)[:, None] * np.array([0.0, 0.0, 1.0]))
+    if truth.planar:
+        height = settings.height_m
+        if height is None:
+            below = (settings.height_offset_m or 0.0) + tags[:, 2].mean()
+            height = run.anchors_by_epoch[..., 2].mean(axis=-1) - below
+        translation = translation.copy()
+        translation[:, 2] = height
+    return rotation, translation, known
+
+
+def _rests(truth: Truth) -> bool:
+    """Return whether the pose of the truth never changes."""
+    moved = np.ptp(truth.translation, axis=0).any()
+    turned = truth.rotation is not None and np.ptp(truth.rotation, axis=0).any()
+    return bool(truth.times[-1] > truth.times[0] and not moved and not turned)
 
 
 def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
