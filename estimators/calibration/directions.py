@@ -256,21 +256,15 @@ def _features(
     return np.stack(columns, axis=-1)
 
 
-class _Told(NamedTuple):
-    """Known height and tilt."""
-
-    height_m: float
-    height_std_m: float
-    tilt_std_rad: float
-
-
 class _Log(NamedTuple):
     ranges: FloatArray  # (K, M, N)
     mask: BoolArray
     anchors: FloatArray
     tags: FloatArray
     model: DirectionModel
-    level: _Told
+    height_m: float
+    height_std_m: float
+    tilt_std_rad: float
 
 
 class _Found(NamedTuple):
@@ -319,8 +313,8 @@ def locate_by_directions(
             f"level must have height_m, height_std_m and tilt_std_rad, got {level!r:.200}"
         )
     rotation, translation = _starts(ranges, mask, anchors, level.height_m)
-    told = _Told(level.height_m, level.height_std_m, level.tilt_std_rad)
-    log = _Log(ranges, mask, anchors, tags, model, told)
+    known = level.height_m, level.height_std_m, level.tilt_std_rad
+    log = _Log(ranges, mask, anchors, tags, model, *known)
     now = _cost(log, rotation, translation)
     damping = np.full(now.cost.shape, 1e-2)
     for _ in range(_ITERATIONS):
@@ -367,13 +361,12 @@ def _starts(
 
 
 def _cost(log: _Log, rotation: FloatArray, translation: FloatArray) -> _Found:
-    anchors, tags, level = log.anchors, log.tags, log.level
-    d = _rays(rotation, translation, anchors, tags)[1]
-    bias, std = direction_model_at(log.model, rotation, translation, anchors, tags)
+    d = _rays(rotation, translation, log.anchors, log.tags)[1]
+    bias, std = direction_model_at(log.model, rotation, translation, log.anchors, log.tags)
     z = np.where(log.mask, (log.ranges - d - bias) / std, 0.0)
     cost = (_late_loss(z)[0] + np.where(log.mask, np.log(std), 0.0)).sum(axis=(-2, -1))
-    height = (translation[..., 2] - level.height_m) / level.height_std_m
-    tilt = (rotation[..., :2, 2] ** 2).sum(axis=-1) / level.tilt_std_rad**2
+    height = (translation[..., 2] - log.height_m) / log.height_std_m
+    tilt = (rotation[..., :2, 2] ** 2).sum(axis=-1) / log.tilt_std_rad**2
     return _Found(cost + 0.5 * (height**2 + tilt), z, std, bias)
 
 
@@ -381,7 +374,7 @@ def _step(
     log: _Log, rotation: FloatArray, translation: FloatArray, now: _Found, damping: FloatArray
 ) -> FloatArray:
     """Return steps (H, K, 6) of the pose error."""
-    anchors, tags, level = log.anchors, log.tags, log.level
+    anchors, tags = log.anchors, log.tags
     u, _ = _rays(rotation, translation, anchors, tags)
     arms = tags @ np.swapaxes(rotation, -1, -2)
     J = np.concatenate([np.cross(arms[..., None, :, :], u), u], axis=-1)
@@ -396,12 +389,12 @@ def _step(
     weighted = weight[..., None] * J
     H = np.einsum("...mni,...mnj->...ij", weighted, J)
     g = np.einsum("...mni,...mn->...i", weighted, z * now.std)
-    about = 1 / level.tilt_std_rad**2
+    about = 1 / log.tilt_std_rad**2
     H[..., [0, 1], [0, 1]] += about
     g[..., 0] += about * rotation[..., 1, 2]
     g[..., 1] -= about * rotation[..., 0, 2]
-    H[..., 5, 5] += 1 / level.height_std_m**2
-    g[..., 5] -= (translation[..., 2] - level.height_m) / level.height_std_m**2
+    H[..., 5, 5] += 1 / log.height_std_m**2
+    g[..., 5] -= (translation[..., 2] - log.height_m) / log.height_std_m**2
     diagonal = np.einsum("...ii->...i", H)
     diagonal *= 1 + damping[..., None]
     return np.clip(np.linalg.solve(H, g[..., None])[..., 0], -0.5, 0.5)

@@ -40,7 +40,7 @@ def start_from_anchors(
     K, N = points.shape[:2]
     if planar:
         points[..., 2] = height_m + tags[:, 2]
-    told: BoolArray = np.asarray(np.isfinite(points).all(axis=-1))
+    told: BoolArray = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.bool_)
     points = np.where(told[..., None], points, np.nan)
     centre = np.nanmean(np.where(told.any(axis=1)[:, None, None], points, 0.0), axis=1)
     rotation = np.broadcast_to(np.eye(3), (K, 3, 3)).copy()
