@@ -42,7 +42,7 @@ def start_from_anchors(
         points[..., 2] = height_m + tags[:, 2]
     told: BoolArray = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.bool_)
     points = np.where(told[..., None], points, np.nan)
-    centre = np.nanmean(np.where(told.any(axis=1)[:, None, None], points, 0.0), axis=1)
+    centre = np.nanmean(np.where((told.sum(axis=1) > 0)[:, None, None], points, 0.0), axis=1)
     rotation = np.broadcast_to(np.eye(3), (K, 3, 3)).copy()
     if N > 1:
         arms = tags - tags.mean(axis=0)
