@@ -90,6 +90,8 @@ ROOMS: dict[str, Any] = {
         # wall; but not behind the pillar.
         ([5.0, 2.0, 2.9], [("-x", "wall", 0.9, 4.1, 2.0), ("-y", "wall", 1.9, 5.0, 0.1)]),
         ([8.2, 5.0, 2.9], [("-y", "wall", 0.5, 8.2, 4.5), ("+x", "wall", 1.7, 9.9, 5.0)]),
+        # Under the ceiling, at the face of the outer wall, which is 0.2 m thick.
+        ([6.0, 5.9, 2.9], [("+y", "wall", 0.0, 6.0, 5.9), ("-x", "wall", 1.9, 4.1, 5.9)]),
         # On the inner wall from the first room: the corner to the left, the door to the right.
         ([3.9, 1.0, 2.5], [("left", "end of the wall", 3.0, 3.9, 4.0),
                            ("right", "wall", 0.9, 3.9, 0.1)]),

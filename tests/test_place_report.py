@@ -189,6 +189,24 @@ def test_the_report_is_the_same_for_the_same_result(placed, tmp_path, monkeypatc
     assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
 
 
+def test_floors_do_not_hide_the_zones_in_a_plan():
+    zone = {"polygon": [[1, 1], [9, 1], [9, 7], [1, 7]], "low_m": 0.2, "high_m": 1.0}
+    tables = {
+        "anchors": {"number": 4},
+        "mounts": [{"kind": "ceiling", "polygon": [[0, 0], [10, 0], [10, 8], [0, 8]],
+                    "height_m": 2.6}],
+        "slabs": [{"polygon": [[0, 0], [10, 0], [10, 8], [0, 8]], "z_m": 2.6}],
+        "obstacles": [{"low": [4, 4, 0], "high": [6, 5, 0.5]}],
+        "zones": [zone],
+        "body": {"shape": "octahedron", "size_m": 0.8},
+        "noise": {"floor_m": 0.1},
+    }  # fmt: skip
+    problem = scene_files.of_mapping(tables)
+    assert len(shapes.solids(problem)) == 2
+    (table,) = shapes.solids_in_plan(problem)
+    assert (table.low_m, table.high_m) == (0.0, 0.5)
+
+
 def test_a_label_has_a_line_to_its_marker_if_it_is_far_or_another_marker_is_near():
     size, points = np.array([20.0, 10.0]), np.array([[0.0, 0.0], [30.0, 0.0], [300.0, 0.0]])
     for place, point, needed in (

@@ -34,7 +34,7 @@ def draw_building(axes: Any, problem: Problem, anchors: FloatArray, names: bool 
     axes.spines[["top", "right", "left", "bottom"]].set_visible(False)
     axes.tick_params(length=2, labelsize=7)
     _draw_backdrop(axes, problem)
-    found = shapes.solids(problem)
+    found = shapes.solids_in_plan(problem)
     axes.add_collection(
         PolyCollection(
             [solid.corners for solid in found],

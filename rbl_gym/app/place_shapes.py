@@ -27,6 +27,8 @@ _FAR = 4.0
 _LEAST_CONTRAST = 1.15
 # The colours of a map end at this many times the limit.
 _MOST_OF_LIMIT = 3.0
+# An obstacle over a whole zone is a floor if it is at most this thick, metres.
+_FLOOR_M = 0.6
 # A hole of a zone is joined to its outline by a slit of this width, metres.
 _SLIT_M = 0.003
 
@@ -92,6 +94,16 @@ def solids(problem: Problem) -> list[Solid]:
     ):
         found.append(Solid(corners, low, high, common if np.isnan(share) else share))
     return sorted(found, key=lambda solid: solid.high_m)
+
+
+def solids_in_plan(problem: Problem) -> list[Solid]:
+    """Return the obstacles to draw in a plan: all but floors, which would hide what is below."""
+    return [
+        solid
+        for solid in solids(problem)
+        if solid.high_m - solid.low_m > _FLOOR_M
+        or not any(contains(solid.corners, zone.polygon).all() for zone in problem.zones)
+    ]
 
 
 def grey(share: float) -> str:

@@ -157,7 +157,7 @@ def _building(draw: _Drawing, placed: Placed) -> str:
     """Return obstacles, mounts, zones and markers."""
     problem, anchors = placed.problem, placed.design.anchors
     parts = []
-    for solid in shapes.solids(problem):
+    for solid in shapes.solids_in_plan(problem):
         level = round(255 * float(shapes.grey(solid.share)))
         style = f'fill="rgb({level},{level},{level})" stroke="#333" stroke-width="0.6"'
         parts.append(draw.polygon(solid.corners, style))
@@ -173,7 +173,7 @@ def _building(draw: _Drawing, placed: Placed) -> str:
 def _labels(placed: Placed, edges: FloatArray) -> str:
     """Return names of zones and markers of anchors, elements of fixed size over the SVG."""
     problem, anchors = placed.problem, placed.design.anchors
-    parts, solids = [], shapes.solids(problem)
+    parts, solids = [], shapes.solids_in_plan(problem)
     for name, anchor, row in zip(
         anchor_names(placed), anchors, placed.result["anchors"], strict=True
     ):

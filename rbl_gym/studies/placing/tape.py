@@ -147,9 +147,11 @@ def _at_right_angles(
     found: list[tuple[str, str, FloatArray]] = []
     first: FloatArray | None = None
     for k in np.argsort(distance, kind="stable").tolist():
-        if not on_edge[k] or distance[k] < _SAME_M:
+        if not on_edge[k]:
             continue
-        along = (feet[k] - place) / distance[k]
+        # The wall is to the left of its edge; an anchor may touch it.
+        inward = np.array([-side[k, 1], side[k, 0]])
+        along = inward if distance[k] < _SAME_M else (feet[k] - place) / distance[k]
         if first is not None and abs(along[0] * first[1] - along[1] * first[0]) < _ACROSS:
             continue
         if _first_hit(place, along, edges) < distance[k] - 1e-6:
@@ -163,7 +165,10 @@ def _at_right_angles(
 
 
 def _edges(problem: Problem, anchor: FloatArray) -> FloatArray:
-    """Return edges (K, 2, 2) of the obstacles that reach an anchor, and of mounts on walls."""
+    """Return edges (K, 2, 2) of the obstacles that reach an anchor, and of mounts on walls.
+
+    The solid side is to the left of an edge.
+    """
     prisms = problem.obstacles.prisms
     lows, highs = box_bounds(problem.obstacles.boxes)
     z = float(anchor[2])
@@ -179,7 +184,10 @@ def _edges(problem: Problem, anchor: FloatArray) -> FloatArray:
         flat = [i for i in range(3) if faces.extents[k, i] > 0 and not upright[k, i]]
         if len(flat) == 1:
             end = faces.origin[k] + faces.extents[k, flat[0]] * faces.axes[k, flat[0]]
-            found.append(np.array([[faces.origin[k][:2], end[:2]]]))
+            line = np.array([faces.origin[k][:2], end[:2]])
+            away = line[1] - line[0]
+            faces_left = away[0] * faces.normal[k, 1] > away[1] * faces.normal[k, 0]
+            found.append(line[None, ::-1] if faces_left else line[None])
     return np.concatenate([*found, np.empty((0, 2, 2))])
 
 
