@@ -86,12 +86,10 @@ def _find_cache() -> Path | None:
         from numba.core import caching
 
         stamp = contents_hash(_FOLDER)
-        bases = (
-            caching.UserProvidedCacheLocator,  # NUMBA_CACHE_DIR
-            caching.InTreeCacheLocator,
-            caching.UserWideCacheLocator,
-        )
-        ours = [_keyed(base, stamp) for base in bases]
+        # The first is for NUMBA_CACHE_DIR. Before numba 0.62 the names began with an underscore.
+        names = ("UserProvidedCacheLocator", "InTreeCacheLocator", "UserWideCacheLocator")
+        own = "" if hasattr(caching, names[0]) else "_"
+        ours = [_keyed(getattr(caching, own + name), stamp) for name in names]
         caching.CacheImpl._locator_classes[:0] = ours
         for locator in ours:
             found = locator.from_function(contents_hash, __file__)
