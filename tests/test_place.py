@@ -238,7 +238,9 @@ def test_the_figures_have_these_names(placed):
         assert set(figures) == {"rms", "median", "p95", "worst", "worst_at_m"}
         assert figures["median"] <= figures["p95"] <= figures["worst"]
     assert set(result["criteria"]) == set(criteria.Criteria._fields)
-    assert set(result["check"]) == {"trials", "prior_rotation_deg", "prior_position_m", "filters"}
+    assert set(result["check"]) == {
+        "trials", "prior_rotation_deg", "prior_position_m", "through_walls", "filters",
+    }  # fmt: skip
     both = [
         f"{name}_{of}{unit}"
         for name, unit in (("position", "m"), ("rotation", "deg"))

@@ -127,8 +127,8 @@ def _through_walls(problem: Problem, drawn: DrawnBodies) -> list[dict[str, Any]]
     Positions are free for the origin of the body only. Such a body would reach through a wall.
     """
     tags = ranging.tag_positions(drawn.rotation, drawn.translation, problem.tags)
-    behind = ~problem.obstacles.sees(drawn.translation[:, None], tags)[..., 0]
-    through = (behind | problem.obstacles.contain(tags)).any(axis=-1)
+    seen = problem.obstacles.sees(drawn.translation[:, None], tags)[..., 0]
+    through = (np.logical_not(seen) | problem.obstacles.contain(tags)).any(axis=-1)
     return [
         {"name": zone.name, "share": float(through[drawn.zone == k].mean())}
         for k, zone in enumerate(problem.zones)
