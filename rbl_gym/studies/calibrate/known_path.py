@@ -23,11 +23,15 @@ from rbl_gym.recordings import Truth, truth_at
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
-# Range of tested time shifts (s), and largest standard deviation of an accepted clock: if the tags
-# are known, and if their moves are estimated with it.
-_SEARCH_S, _CLOCK_STD_S, _WITH_TAGS_STD_S = 1.0, 0.05, 0.2
-# Number of epochs for coarse starts, and the ratio of misfits below which a rotation is accepted.
-_COARSE, _BETTER = 400, 0.8
+# Range of tested time shifts, seconds.
+_SEARCH_S = 1.0
+# Largest standard deviation of an accepted clock (s): if the tags are known, and if their moves are
+# estimated with it.
+_CLOCK_STD_S, _WITH_TAGS_STD_S = 0.05, 0.2
+# Number of epochs for coarse starts.
+_COARSE = 400
+# Ratio of misfits below which a rotation is accepted.
+_BETTER = 0.8
 
 
 class Log(NamedTuple):

@@ -62,8 +62,8 @@ def _with_anchor(
     }
 
 
-def _overall(judged: list[Judged]) -> float:
-    return float(overall_score([one.zone for one in judged], [one.judged.score for one in judged]))
+def _overall(zones: list[Judged]) -> float:
+    return float(overall_score([one.zone for one in zones], [one.judged.score for one in zones]))
 
 
 def is_flat(anchors: FloatArray) -> bool:
