@@ -196,11 +196,14 @@ def test_every_way_to_train_makes_a_policy_that_plays(monkeypatch, tmp_path, tas
 
     monkeypatch.setattr(sight_training, "_TRACKS", 3)
     steps: list[int] = []
-    made = [training.train("mine", task, task.steps, 1, steps.append, algorithm) for _ in range(2)]
+    made = [
+        training.train("mine", task, task.training.steps, 1, steps.append, algorithm)
+        for _ in range(2)
+    ]
     policy, figures = made[0]
     assert policy.kind == kind
     assert policy.meta["algorithm"] == figures["algorithm"] == algorithm
-    assert sum(steps) == 2 * task.steps
+    assert sum(steps) == 2 * task.training.steps
     for k, (one, _) in enumerate(made):
         policies.save(one, tmp_path / f"{k}.npz")
     # The same seed gives the same bytes.
@@ -277,7 +280,7 @@ def test_files_play_what_the_model_would(task, algorithm):
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
     envs = Sb3VecEnv(task.make(3))
-    model = training._model(algorithm, task, envs, 0)
+    model = training._model(algorithm, task.training, envs, 0)
     policy = sb3_models.policy_of(model)
     env = task.make(3, "Disabled")
     (seen, _), state, play = env.reset(seed=5), None, policy.player()
