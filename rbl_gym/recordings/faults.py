@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,6 +18,9 @@ from rbl_gym.recordings.ranges import read_log
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import read_table
 from rbl_gym.recordings.truth import read_truth
+
+# Name of a column of one link, also by a pattern with its two braces.
+_OF_LINK = re.compile(r"a.+t.+|.*\d+.*\d+").fullmatch
 
 
 @contextlib.contextmanager
@@ -66,8 +70,9 @@ def _readers(
             for known, name in zip(points, ("anchors", "tags"), strict=True)
         ):
             read_log(table, *points, format, Said())
-        else:
-            table.seconds(format.time_unit)
+        elif "difference" not in table.columns and not any(map(_OF_LINK, table.names.values())):
+            table.require("t", *["anchor"] * (files.anchors is not None), "range")
+        table.seconds(format.time_unit)
 
     for kind in ("anchor", "tag"):
         name = f"{kind}s"
