@@ -20,9 +20,9 @@ __all__ = ["Clock", "find_clock"]
 # multiple of it. Longer ones carry more information, shorter ones contain less of slow errors.
 _LAGS_S, _LONGEST = (0.2, 0.4, 0.8), 3.0
 _SEARCH_STEP_S, _FEWEST, _BLOCK_S = 0.1, 30, 2.0
-# Shifts (s) of the finite differences for rates. Rates over a short time would contain the noise of
-# the path: they would look large, and the offset certain.
-_NEAR_S = np.array([0.05, 0.1, 0.15, 0.2, 0.25])
+# Half-widths (s) of two finite differences for rates. The noise of the path makes each of them look
+# large, but it is not the same in both: their product tells how much the ranges really change.
+_NEAR_S, _FAR_S = 0.05, 0.1
 _LEAST_M = 1e-4
 # Gauss-Newton steps at most, the step (s) below which they end, and how often rates are renewed.
 _STEPS, _CLOSE_S, _ROUNDS = 20, 1e-5, 2
@@ -100,12 +100,9 @@ class _Changes(NamedTuple):
         foretold, known = self.foretold(shift)
         return self.change - foretold, known
 
-    def rate(self, shift: float) -> FloatArray:
-        """Return the rates (P,) of the predicted changes: least squares over near shifts."""
-        rise = sum(
-            near * (self.left(shift - near)[0] - self.left(shift + near)[0]) for near in _NEAR_S
-        )
-        return rise / (2 * (_NEAR_S**2).sum())
+    def rate(self, shift: float, half_s: float) -> FloatArray:
+        """Return the rates (P,) of the predicted changes by a finite difference."""
+        return (self.left(shift - half_s)[0] - self.left(shift + half_s)[0]) / (2 * half_s)
 
     def spread(self, shift: float) -> float:
         """Return the robust standard deviation of the residual changes."""
@@ -120,16 +117,16 @@ def _refined(changes: _Changes, start: float, moves: FloatArray) -> Clock | None
     """
     half = 1.5 * _SEARCH_STEP_S
     # One set of changes for all shifts: the loss would jump where a change enters or leaves.
-    ends = start - half - _NEAR_S[-1], start, start + half + _NEAR_S[-1]
+    ends = start - half - _FAR_S, start, start + half + _FAR_S
     known = np.all([changes.left(shift)[1] for shift in ends], axis=0)
     if known.sum() < _FEWEST:
         return None
     std = float(robust.spread(changes.left(start)[0], known, _LEAST_M))
     moved = changes.of(moves)[known] / std
     offset, move = start, np.zeros(moved.shape[-1])
-    z = share = rate = np.empty(0)  # of the last step
+    z = share = rate = other = np.empty(0)  # of the last step
     for _ in range(_ROUNDS):
-        rate = changes.rate(offset)[known] / std
+        rate, other = (changes.rate(offset, h)[known] / std for h in (_NEAR_S, _FAR_S))
         for _ in range(_STEPS):
             z = changes.left(offset)[0][known] / std - moved @ move
             share = robust.share_of(z)
@@ -137,18 +134,19 @@ def _refined(changes: _Changes, start: float, moves: FloatArray) -> Clock | None
             weighted = moved * share[:, None]
             inverse = np.linalg.inv(weighted.T @ moved + np.eye(len(move)))
             own = rate - moved @ (inverse @ (weighted.T @ rate))
-            information = float((share * own * rate).sum())
+            information = float((share * own * other).sum())
             if not information > 0:
                 return None
             step = float((own * share * (z + moved @ move)).sum()) / information
             step = float(np.clip(step, -_SEARCH_STEP_S, _SEARCH_STEP_S))
             offset += step
-            move = inverse @ (weighted.T @ (z + moved @ move - rate * step))
+            move = inverse @ (weighted.T @ (z + moved @ move - other * step))
             if abs(offset - start) > half:
                 return None
             if abs(step) < _CLOSE_S:
                 break
-    return _jackknifed(offset, changes.times[known], z, share, np.column_stack([rate, moved]))
+    rates = np.stack([np.column_stack([one, moved]) for one in (rate, other)])
+    return _jackknifed(offset, changes.times[known], z, share, rates)
 
 
 def _jackknifed(
@@ -158,11 +156,11 @@ def _jackknifed(
 
     Changes overlap and their errors are correlated, so whole blocks are left out. Blocks in which
     the body turns or stops determine the offset and the tags more than others: unlike the sum of
-    squared scores, the jackknife allows for this. `rates` (P, 1 + D) are the derivatives of the
-    residuals z (P,) by the offset and the moves of the tags.
+    squared scores, the jackknife allows for this. `rates` (2, P, 1 + D) are two estimates of the
+    derivatives of the residuals z (P,) by the offset and the moves of the tags.
     """
     block = np.unique((times // _BLOCK_S).astype(int), return_inverse=True)[1]
-    count, width = int(block.max()) + 1, rates.shape[1]
+    count, width = int(block.max()) + 1, rates.shape[-1]
     freedom = count - 1 - width
     if freedom <= 2:
         return None
@@ -170,12 +168,12 @@ def _jackknifed(
     curvature = max(float(np.where(share < 1, -share, 1.0).mean()), 0.1)
     prior = np.diag([0.0, *np.ones(width - 1)])
     score, information = np.zeros((count, width)), np.zeros((count, width, width))
-    np.add.at(score, block, (share * z)[:, None] * rates)
+    np.add.at(score, block, (share * z)[:, None] * rates[0])
     for i in range(count):
-        mine = rates[block == i]
-        information[i] = curvature * mine.T @ mine
+        one, other = rates[:, block == i]
+        information[i] = curvature * one.T @ other
     left = information.sum(axis=0) - information + prior
-    if not (np.linalg.eigvalsh(left)[:, 0] > 0).all():
+    if not (np.linalg.eigvalsh(left + np.swapaxes(left, -1, -2))[:, 0] > 0).all():
         return None
     without = np.linalg.solve(left, -score[..., None])[:, 0, 0]
     variance = (count - 1) / count * np.square(without - without.mean()).sum()
