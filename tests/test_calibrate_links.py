@@ -223,9 +223,9 @@ def test_clock_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("lasts_s", "path_std", "seeds"), [(60, 0.0, 4), (60, 0.01, 4), (20, 0.0, 4)]
+    ("lasts_s", "path_std", "most_s"), [(60, 0.0, 0.02), (60, 0.01, 0.04), (20, 0.0, 0.201)]
 )
-def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way(lasts_s, path_std, seeds):
+def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way(lasts_s, path_std, most_s):
     """A tag further ahead looks like a later clock, and lost ranges change what is known.
 
     A path with noise (m and rad) has large rates, and a short log leaves few blocks of time.
@@ -246,7 +246,7 @@ def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way(lasts_s, p
     d = np.linalg.norm(places[:, None] - hall[:, None], axis=-1)
     on_truth = np.arange(0, lasts_s, 0.02)
     settings = calibrate.LinkSettings(slopes=False, planar=True)
-    for seed in range(seeds):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         ranges = d + 0.08 * rng.standard_normal(d.shape)
         ranges += np.where(rng.random(d.shape) < 0.05, rng.uniform(0.5, 4, d.shape), 0)
@@ -258,12 +258,12 @@ def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way(lasts_s, p
         recording = recording_of(times, ranges, truth, tags)._replace(anchors=hall)
         found = calibrate.calibrate_links(recording, settings)
         assert found.clock is not None
-        assert found.clock.std_s < (0.02 if lasts_s == 60 else 0.201)
+        assert found.clock.std_s < most_s
         z.append((found.clock.offset_s - 0.3) / found.clock.std_s)
         assert (np.abs(found.fit.tags - tags)[:, :2] < 5 * found.fit.tags_std_m[:, :2] + 1e-3).all()
     # Squared deviations: the largest below 4 sigma, the sum below its 99.99 % point.
     assert np.abs(z).max() < 4
-    assert np.square(z).sum() < scipy.stats.chi2.ppf(0.9999, seeds)
+    assert np.square(z).sum() < scipy.stats.chi2.ppf(0.9999, len(z))
 
 
 @pytest.mark.parametrize("slopes", [True, False])
