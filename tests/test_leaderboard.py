@@ -384,17 +384,31 @@ def test_a_run_that_was_cut_off_goes_on_and_ends_in_the_same_bytes(
     assert [r["filter"] for r in rows(more)][:2] == ["iekf", "uc-kf"]
 
 
-def test_a_file_takes_one_run_unless_it_is_replaced(tmp_path, short, capsys):
+def test_a_file_keeps_records_of_other_settings_until_it_is_replaced(
+    tmp_path, short, monkeypatch, capsys
+):
     options = ["--scenes", short, "--filters", "kf", "--conditions", "nominal"]
     _, first = bench(tmp_path, *options)
-    status, kept = bench(tmp_path, *options, "--seed", 1)
-    assert (status, kept) == (2, first)
-    said = capsys.readouterr().err
-    assert "has records with seed 0, but this run has 1" in said
-    assert "with --out F, or drop the old records with --fresh" in said
-    assert "versions" not in said
+    (old,) = rows(first)
+    (tmp_path / "x.jsonl").write_text(json.dumps(old | {"versions": {"numpy": "1.0"}}) + "\n")
+    _, updated = bench(tmp_path, *options)
+    assert [row["versions"] for row in rows(updated)] == [old["versions"], {"numpy": "1.0"}]
+    status, both = bench(tmp_path, *options, "--trials", 7, "--seed", 1)
+    assert status == 0
+    assert [(row["trials"], row["seed"]) for row in rows(both)] == [(7, 1), (6, 0), (6, 0)]
+    assert rows(both)[1:] == rows(updated)
+    capsys.readouterr()
+    # Each is the result of its settings, and none is computed again.
+    assert main(["rerun", str(tmp_path / "x.jsonl")]) == 0
+    assert "3 of 3 records are identical" in capsys.readouterr().out
+    with monkeypatch.context() as patch:
+        patch.setattr(leaderboard, "run_task", lambda task: pytest.fail(f"ran {task} again"))
+        assert bench(tmp_path, *options, "--json", tmp_path / "x.json")[0] == 0
+    (row,) = json.loads((tmp_path / "x.json").read_text())["rows"]
+    assert (row["trials"], row["seed"], row["versions"]) == (6, 0, old["versions"])
     status, other = bench(tmp_path, *options, "--seed", 1, "--fresh")
     assert status == 0
+    assert [(row["trials"], row["seed"]) for row in rows(other)] == [(6, 1)]
     assert rows(other)[0]["tags_m"] != rows(first)[0]["tags_m"]
     (tmp_path / "x.jsonl").write_text("not a record\n{}\n")
     assert bench(tmp_path, *options)[0] == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from rbl_gym.app.cli import main
 from rbl_gym.estimators import IteratedEkf, PoseBelief, one_by_one
 from rbl_gym.testing import check_filter
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
@@ -36,6 +38,22 @@ class OneBody:
 
     def belief(self, state):
         return self.inner.belief(self.state)
+
+
+class Ambiguous(OneBody):
+    """An array as a condition, as code for one body often has it."""
+
+    def initial(self, rotation, translation, covariance):
+        if np.trace(covariance) > 0:
+            super().initial(rotation, translation, covariance)
+
+
+class Refuses(OneBody):
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        raise ValueError("never")
+
+
+Batched = one_by_one(OneBody)
 
 
 class NoNoise(OneBody):
@@ -108,6 +126,28 @@ def test_a_filter_of_one_body_is_told_what_to_do(filter, named):
         vector(filter, short("hall", 4))
     with pytest.raises(AssertionError, match=r"must accept leading batch axes .*one_by_one"):
         check_filter(filter)
+
+
+def test_the_benchmark_names_the_loop_and_the_status_is_an_error(tmp_path, capsys):
+    (tmp_path / "short.json").write_text('{"name": "uwb_room", "steps": 3}')
+
+    def bench(filters: str, *more: str) -> int:
+        arguments = ["--scenes", str(tmp_path / "short.json"), "--out", str(tmp_path / "x.jsonl")]
+        return main(["bench", "--filters", filters, "--trials", "4", *arguments, *more])
+
+    here = "tests.test_one_by_one"
+    assert bench(f"iekf,{here}:Ambiguous", "--conditions", "nominal") == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "ValueError at epoch 0: The truth value of an array" in said
+    assert f"{here}:Ambiguous accepts a single body" in said
+    assert "Batched = rbl_gym.estimators.one_by_one(...)" in said
+    # An error that every body has is left as it is.
+    assert bench(f"{here}:Refuses", "--conditions", "nominal") == 1
+    assert "single body" not in capsys.readouterr().out
+    assert bench(f"iekf/iterations=1,{here}:Batched", "--json", str(tmp_path / "x.json")) == 0
+    rows = json.loads((tmp_path / "x.json").read_text())["rows"]
+    for want, got in zip(rows[::2], rows[1::2], strict=True):
+        np.testing.assert_allclose(got["tags_m"]["rmse"], want["tags_m"]["rmse"], rtol=1e-6)
 
 
 def test_an_error_that_one_body_also_has_stays_as_it_is():

@@ -141,9 +141,9 @@ def key_of(record: Mapping[str, Any]) -> str:
     return json.dumps([record[name] for name in KEY], sort_keys=True)
 
 
-def timing_key(row: Mapping[str, Any]) -> tuple[str, ...]:
+def timing_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return the key of a time within one run."""
-    return row["scene_hash"], row["condition"], row["filter"]
+    return row["scene_hash"], row["condition"], row["filter"], row["trials"], row["seed"]
 
 
 def keys_of(task: Task) -> dict[str, str]:
@@ -222,7 +222,7 @@ def _digest(files: list[Path]) -> str:
 
 
 def summary(
-    records: Sequence[Mapping[str, Any]], timings: Mapping[tuple[str, ...], float | None]
+    records: Sequence[Mapping[str, Any]], timings: Mapping[tuple[Any, ...], float | None]
 ) -> dict[str, Any]:
     """Return the leaderboard as plain numbers.
 

@@ -20,8 +20,8 @@ from rbl_gym.studies.bench.leaderboard import Task
 __all__ = ["read_records", "read_timings", "rerun", "run_tasks"]
 
 Records = list[dict[str, Any]]
-# Fields that all records of a file share.
-_COMMON = ("trials", "seed", "versions")
+# Fields that tell the runs of one version apart.
+_PLACE = ("scene", "condition", "filter", "trials", "seed")
 
 
 def timings_path(path: Path) -> Path:
@@ -40,8 +40,8 @@ def run_tasks(
     """Run tasks that are missing in a file; return all records, in order, and their times.
 
     Every finished task is written immediately, so that the same call resumes an interrupted run.
-    Records of other scenes, conditions or filters with the same trials, seed and versions stay in
-    the file, after those of the tasks.
+    All other records stay in the file, after those of the tasks, also those with other trials,
+    seeds or versions.
 
     Parameters
     ----------
@@ -59,8 +59,7 @@ def run_tasks(
     Raises
     ------
     ValueError
-        If the file holds records with other trials, seed or versions, or a worker has other
-        versions.
+        If a line of the file is not a record, or a worker has other versions.
     """
     if fresh:
         for file in (path, timings_path(path)):
@@ -71,14 +70,13 @@ def run_tasks(
         if path.exists()
         else {}
     )
-    _check_same_run(path, list(found.values()), tasks)
     # An incomplete last line must not be joined to the next one.
     _write(path, list(found.values()))
     advance(sum(key in found for key in wanted))
     with path.open("a", encoding="utf-8") as file, timings_path(path).open("a") as times:
         for _, results in backends.each(leaderboard.run_task, _left(tasks, found), workers):
             for record, microseconds in results:
-                _check_same_run("a worker", [record], tasks)
+                _check_worker(record)
                 found[leaderboard.key_of(record)] = record
                 file.write(_line(record))
                 times.write(_line(_timing(record, microseconds)))
@@ -100,17 +98,12 @@ def _left(tasks: Sequence[Task], found: Mapping[str, Any]) -> list[Task]:
     return left
 
 
-def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None:
-    common = {"trials": tasks[0].trials, "seed": tasks[0].seed, "versions": leaderboard.versions()}
-    for record in records:
-        for name in _COMMON:
-            if record[name] != common[name]:
-                workers = ". All workers need the same versions" if name == "versions" else ""
-                raise ValueError(
-                    f"{where} has records with {name} {record[name]}, but this run has "
-                    f"{common[name]}, and a file holds one run: choose another file with --out F, "
-                    f"or drop the old records with --fresh{workers}"
-                )
+def _check_worker(record: Mapping[str, Any]) -> None:
+    if record["versions"] != leaderboard.versions():
+        raise ValueError(
+            f"all workers must have the versions of this process, {leaderboard.versions()}, but "
+            f"one has {record['versions']}"
+        )
 
 
 def read_records(path: Path) -> Records:
@@ -163,8 +156,9 @@ def _text(path: Path) -> str:
 
 
 def _timing(record: Mapping[str, Any], microseconds: float | None) -> dict[str, Any]:
-    row = {name: record[name] for name in ("scene", "scene_hash", "condition", "filter")}
-    return row | {"microseconds_per_step": microseconds}
+    return {name: record[name] for name in ("scene_hash", *_PLACE)} | {
+        "microseconds_per_step": microseconds
+    }
 
 
 def _line(row: Mapping[str, Any]) -> str:
@@ -195,9 +189,10 @@ def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
         )
         key = json.dumps(task._replace(filters=()), sort_keys=True)
         before = grouped.get(key)
-        grouped[key] = (
-            task if before is None else before._replace(filters=(*before.filters, record["filter"]))
-        )
+        if before is None:
+            grouped[key] = task
+        elif record["filter"] not in before.filters:  # a record of other versions may be there
+            grouped[key] = before._replace(filters=(*before.filters, record["filter"]))
     return list(grouped.values())
 
 
@@ -248,15 +243,16 @@ def rerun(
     Returns
     -------
     A dict. ``records`` and ``identical`` are counts. ``changed`` has rows with scene, condition,
-    filter, ``relative_change`` (the largest of a figure; None if another value changed), ``field``
-    (its name), ``before`` and ``after``. ``versions`` has the two versions by name where they
-    differ; ``sources`` has the same for filters and scenes whose own files changed.
+    filter, trials, seed, ``relative_change`` (the largest of a figure; None if another value
+    changed), ``field`` (its name), ``before`` and ``after``. ``versions`` has the two versions by
+    name where they differ; ``sources`` has the same for filters and scenes whose own files changed.
     """
-    before = {_place(record): record for record in records}
+    before: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for record in records:
+        before.setdefault(_place(record), []).append(record)
     rows, versions, sources, identical = [], {}, {}, 0
     for _, results in backends.each(leaderboard.run_task, tasks_of(records), workers):
-        for record, _ in results:
-            old = before[_place(record)]
+        for record, old in ((new, old) for new, _ in results for old in before[_place(new)]):
             found = compare(old, record)
             for path in [path for path in found if path.startswith("versions.")]:
                 versions[path.removeprefix("versions.")] = found.pop(path)
@@ -278,15 +274,15 @@ def rerun(
     }
 
 
-def _place(record: Mapping[str, Any]) -> tuple[str, ...]:
-    return record["scene"], record["condition"], record["filter"]
+def _place(record: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(record[name] for name in _PLACE)
 
 
 def _change(record: Mapping[str, Any], found: dict[str, tuple[Any, Any]]) -> dict[str, Any]:
     field = max(found, key=lambda path: relative_change(found[path]))
     change = relative_change(found[field])
     return {
-        **{name: record[name] for name in ("scene", "condition", "filter")},
+        **{name: record[name] for name in _PLACE},
         "fields": len(found),
         "field": field,
         "before": found[field][0],

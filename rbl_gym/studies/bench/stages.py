@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -22,6 +23,14 @@ from rbl_gym.studies.epochs import (
     track_epochs,
 )
 from rbl_gym.worlds import scenes
+
+# Further words of a message for a filter that does not accept leading axes.
+_ONE_BODY = (
+    ". A filter must accept leading batch axes (here {batch}), and {name} accepts a single body: "
+    "write its formulas for arrays (..., 3, 3), or add a line Batched = "
+    "rbl_gym.estimators.one_by_one(...), which loops over the bodies, to its module, and name "
+    "Batched here"
+)
 
 
 class Tracked(NamedTuple):
@@ -49,7 +58,7 @@ class BenchStage(NamedTuple):
     the path, and `batch` the leading axes of a belief.
     """
 
-    make: Callable[[str, dict[str, Any]], estimators.Filter]
+    make: Callable[[str | Callable[..., Any], dict[str, Any]], estimators.Filter]
     track: Callable[[estimators.Filter], Iterator[Step]]
     figures: Callable[[Tracked], dict[str, Any]]
     anchors: FloatArray
@@ -127,7 +136,10 @@ def run_filter(
     try:
         tracked = _track(stage.track(filter), stage.batch)
     except StoppedError as stop:
-        return result | _stopped(stop), None
+        stopped = _stopped(stop)
+        if _takes_one_body(stage, name, options, stop.epoch):
+            stopped["message"] += _ONE_BODY.format(batch=stage.batch, name=name)
+        return result | stopped, None
     result["trigger_rate"] = json_number(tracked.trigger_rate)
     trials = tracked.belief.translation[0, ..., 0].size
     return result | stage.figures(tracked), 1e6 * tracked.seconds / trials
@@ -153,6 +165,18 @@ def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
             raise StoppedError(len(beliefs), error) from error
     rate = None if triggers[0] is None else float(np.mean(triggers))
     return Tracked(stack_beliefs(beliefs), rate, seconds_per_step(times))
+
+
+def _takes_one_body(stage: BenchStage, name: str, options: dict[str, Any], epoch: int) -> bool:
+    """Return whether a filter that stopped at an epoch works for each body alone."""
+    if not stage.batch or epoch > 1:  # the first prediction is that of epoch 1
+        return False
+    try:
+        filter = stage.make(estimators.one_by_one(name), options)
+        _track(itertools.islice(stage.track(filter), epoch + 1), stage.batch)
+    except Exception:
+        return False
+    return True
 
 
 def _stopped(stop: StoppedError) -> dict[str, Any]:
