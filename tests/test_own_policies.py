@@ -169,3 +169,56 @@ def test_a_model_of_stable_baselines3():
     both = {"model": model, "file": policy_of(model)}
     found = evaluate(gym.make(ID, **SHORT), both, [], worlds=3)["methods"]
     assert found["model"]["loss"] == pytest.approx(found["file"]["loss"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{}, {"sort_craft": False}, {"observation": "dict"}, {"scenes": "auv_craft"}],
+)
+def test_a_policy_of_craft_needs_only_the_anchors_and_the_belief(arguments):
+    """Entries of actions and anchors belong to the same craft, in any order of the craft."""
+    env = gym.make("rbl_gym:RBL/MobileAnchors-v0", **arguments)
+    envs = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=6, **arguments)
+    for one, batch in ((env.unwrapped, ()), (envs.unwrapped, (6,))):
+        one.reset(seed=2)
+        before = one.anchors
+        gap = before[..., :2] - one.belief.translation[..., None, :2]
+        if not arguments:
+            bearing = np.arctan2(gap[..., 1], gap[..., 0])
+            assert (np.diff(bearing, axis=-1) > 0).all()
+            np.testing.assert_array_equal(
+                before,
+                np.take_along_axis(one.inner_observation["anchors"], one.order[..., None], -2),
+            )
+        velocity = np.random.default_rng(1).uniform(-0.7, 0.7, (*batch, 3, 2))
+        numbers = one.order.copy()
+        one.step(velocity.reshape(*batch, 6))
+        after = np.take_along_axis(one.inner_observation["anchors"], numbers[..., None], axis=-2)
+        np.testing.assert_allclose((after - before)[..., :2], 8 * velocity, atol=1e-9)
+
+
+def circle(env, observation):
+    """The policy of docs/environments/mobile_anchors.md."""
+    gap = env.anchors[..., :2] - env.belief.translation[:, None, :2]
+    radius = 0.9 * np.abs(env.belief.translation[:, 2:])
+    slot = 2 * np.pi / 3 * np.arange(3)
+    angle = np.arctan2(gap[..., 1], gap[..., 0])
+    turn = np.angle(np.exp(1j * (angle - slot)).mean(axis=1, keepdims=True))
+    place = turn + slot + 8.0 / radius
+    target = radius[..., None] * np.stack([np.cos(place), np.sin(place)], axis=-1)
+    return ((target - gap) / 8.0).reshape(len(gap), -1)
+
+
+def test_the_policy_of_the_page_is_as_good_as_the_orbit():
+    """It is the orbit without the prediction of one step: within 0.05 of its mean log b."""
+    losses = {}
+    for name in ("mine", "orbit", "random"):
+        env = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=16).unwrapped
+        seen, _ = env.reset(seed=3)
+        rng, total = np.random.default_rng(0), 0.0
+        for _ in range(40):
+            actions = circle(env, seen) if name == "mine" else controllers.MOBILE[name](env, rng)
+            seen, reward, *_ = env.step(actions)
+            total -= reward.mean() / 40
+        losses[name] = total
+    assert abs(losses["mine"] - losses["orbit"]) < 0.05 < losses["random"] - losses["orbit"]

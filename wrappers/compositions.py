@@ -76,7 +76,7 @@ class Task(StatedLength):
 
     @property
     def anchors(self) -> FloatArray:
-        """Present positions of the anchors, (..., M, 3)."""
+        """Present positions of the anchors, (..., M, 3), in the order of the actions."""
         return self._last_observation()["anchors"]
 
     @property

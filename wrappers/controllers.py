@@ -14,7 +14,7 @@ from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
 from rbl_gym.motion.kinematics import propagate
 from rbl_gym.wrappers.selection import AnchorSelectionVectorEnv
-from rbl_gym.wrappers.situations import Controller, Situation, in_each_scene
+from rbl_gym.wrappers.situations import Controller, Situation, craft_by_number, in_each_scene
 from rbl_gym.wrappers.tasks import MobileAnchorsVectorEnv
 
 __all__ = [
@@ -58,7 +58,7 @@ def _around(env: MobileAnchorsVectorEnv, depths: float, ahead: float) -> FloatAr
     """Return targets (B, M, 2) on a ring around the estimate, see `on_ring`."""
     reach = np.full(env.num_envs, env.scene.anchor_speed_m_s * env.scene.dt)
     centre = env.belief.translation + env.twist[:, 3:] * (env.scene.dt, env.scene.dt, 0.0)
-    return on_ring(centre, env.anchors, reach, depths, ahead)
+    return on_ring(centre, craft_by_number(env), reach, depths, ahead)
 
 
 def on_ring(
@@ -85,7 +85,7 @@ def on_ring(
 def _towards(env: MobileAnchorsVectorEnv, targets: FloatArray) -> np.ndarray:
     """Return actions that move craft to targets (B, M, 2), or as close as one step allows."""
     reach = env.scene.anchor_speed_m_s * env.scene.dt
-    return _ordered(env, (targets - env.anchors[..., :2]) / reach)
+    return _ordered(env, (targets - craft_by_number(env)[..., :2]) / reach)
 
 
 def _ordered(env: MobileAnchorsVectorEnv, velocity: FloatArray) -> np.ndarray:
@@ -134,7 +134,8 @@ def _plan_cost(
     """Return the mean log b (B, S) of plans (B, S, H, M, 2) along the predicted poses."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
     information = np.linalg.inv(env.belief.covariance)[:, None]
-    anchors = np.broadcast_to(env.anchors[:, None], (*plans.shape[:2], *env.anchors.shape[1:]))
+    craft = craft_by_number(env)
+    anchors = np.broadcast_to(craft[:, None], (*plans.shape[:2], *craft.shape[1:]))
     cost = np.zeros(plans.shape[:2])
     for k, (rotation, translation) in enumerate(poses):
         step = np.zeros(anchors.shape)

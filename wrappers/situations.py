@@ -63,6 +63,16 @@ def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
         )
 
 
+def craft_by_number(env: Any) -> FloatArray:
+    """Return positions (..., M, 3) of the craft in the order of their numbers.
+
+    `env.anchors` is in the order of the actions.
+    """
+    craft = np.empty_like(env.anchors)
+    np.put_along_axis(craft, env.order[..., None], env.anchors, axis=-2)
+    return craft
+
+
 def action_of(env: Any, scores: np.ndarray) -> np.ndarray:
     """Return the action for scores (..., M) of the anchors, in the form of the environment."""
     if env.mode == "priced":

@@ -34,8 +34,14 @@ _CRAFT_VIEW = ("belief_translation", "belief_rotation", "belief_covariance", "tw
 class _MobileAnchors(Task):
     """Craft in the order of the observation, for scalar and vector forms."""
 
-    # Numbers (..., M) of the craft in the order of the last observation.
+    # Numbers (..., M) of the craft in the order of the last observation and of the actions.
     order: np.ndarray
+
+    @property
+    def anchors(self) -> FloatArray:
+        """Present positions of the craft, (..., M, 3), in the order of the actions."""
+        anchors = self._last_observation()["anchors"]
+        return np.take_along_axis(anchors, self.order[..., None], axis=-2)
 
     def _configure(self, difficulty: str, scene: Any, sort_craft: bool, scenes: Any) -> None:
         level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
@@ -140,7 +146,7 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     * log of their distances divided by 100 m (M).
 
     Craft are sorted by bearing from the estimate; ``sort_craft=False`` keeps the order of their
-    numbers.
+    numbers. `anchors` has their positions in the order of the actions, and `order` their numbers.
 
     ## Reward
     ``-log b`` of the belief after every step (`rbl_gym.bounds.score`), or another `reward`.

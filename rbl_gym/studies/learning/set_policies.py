@@ -11,7 +11,7 @@ from rbl_gym.motion.kinematics import propagate
 from rbl_gym.studies.learning.deep_sets import DeepSets, check_sets
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers import controllers, craft_tokens, sight_tokens, views
-from rbl_gym.wrappers.situations import action_of, situations
+from rbl_gym.wrappers.situations import action_of, craft_by_number, situations
 
 __all__ = ["SET_KINDS", "SetPolicy"]
 
@@ -75,7 +75,7 @@ def _mask(env: Any) -> np.ndarray:
 def craft_seen(env: Any) -> craft_tokens.CraftTokens:
     """Return the input (B, M, ...) of each craft of an environment; B is 1 for a scalar one."""
     rotation, translation, covariance = _batched(env, *env.belief[:3])
-    twist, craft = _batched(env, env.twist, env.anchors)
+    twist, craft = _batched(env, env.twist, craft_by_number(env))
     reach = np.broadcast_to(views.reach_of_craft(env.world), len(craft))
     return craft_tokens.craft_tokens(
         rotation, translation, covariance, twist, craft, _mask(env), reach, env.world.dt

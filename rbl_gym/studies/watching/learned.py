@@ -147,10 +147,10 @@ def _reference_steps(task: RlTask, name: str, seed: int) -> Iterator[tuple[Float
     act = evaluation.reference_player(task, name, seed)
     env, seen, info = rollouts.held_out(task, 1, seed)
     while True:
-        yield env.anchors[0].copy(), float(info["score_m"][0])
+        yield env.inner_observation["anchors"][0].copy(), float(info["score_m"][0])
         seen, _, terminated, truncated, info = env.step(act(env, seen))
         if (terminated | truncated).any():
-            yield env.anchors[0].copy(), float(info["score_m"][0])
+            yield env.inner_observation["anchors"][0].copy(), float(info["score_m"][0])
             return
 
 
