@@ -407,11 +407,37 @@ def test_other_scenes_give_finite_observations(kind, scene):
 
 
 @pytest.mark.parametrize(
+    ("scene", "level", "n_anchors", "speed"),
+    [
+        ("auv_craft", "easy", 3, 4.0),
+        ("auv_craft", "hard", 2, 2.0),
+        ({"name": "auv_craft", "anchor_speed_m_s": 3.0}, "hard", 2, 3.0),
+        ({"name": "auv_craft", "anchors": [[9.0 * i, 0, 0] for i in range(5)]}, "hard", 5, 2.0),
+        ("auv_buoys", "easy", 4, 4.0),
+        ("satellite", "easy", 5, 1.0),
+        ({"name": "uwb_room", "anchor_speed_m_s": 0.5}, "easy", 6, 0.5),
+    ],
+)
+def test_the_difficulty_leaves_what_a_scene_says(scene, level, n_anchors, speed):
+    arguments: list[dict[str, Any]] = [{"scene": scene}]
+    if isinstance(scene, dict):
+        arguments.append({"scenes": [scene]})
+    for given in arguments:
+        env = MobileAnchorsEnv(level, **given)
+        assert (env.scene.n_anchors, env.scene.anchor_speed_m_s) == (n_anchors, speed)
+        assert env.action_space.shape == (2 * n_anchors,)
+        env.reset(seed=1)
+        assert env.anchors.shape == (n_anchors, 3)
+
+
+@pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [
         (0, {"difficulty": "x"}, "difficulty must be one of 'easy', 'hard', got 'x'"),
         (0, {"difficulty": ["easy"]}, "difficulty must be one of"),
         (0, {"scene": "mars"}, "scene must be one of"),
+        (0, {"scene": "uwb_room"}, "anchor_speed_m_s = 0 in 'uwb_room': set anchor_speed_m_s"),
+        (0, {"scene": "satellite", "difficulty": "hard"}, "difficulty must be left out without"),
         (
             0,
             {"scene": {"name": "auv_craft", "anchor_speed_m_s": 0}},

@@ -27,12 +27,17 @@ SELECTIONS = ("top-k", "priced", "subset")
 _MOST_SUBSETS = 10_000
 
 
+def _defaults(_: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of the task, for scenes that do not set them."""
+    return {"steps": 50}
+
+
 class _AnchorSelection(Task):
     """Choices and their price, for scalar and vector forms."""
 
     def _configure(self, mode: str, k: int, price: float, scene: Any, scenes: Any) -> None:
-        found = family_of_task(scenes, scene, "hall", steps=50)
-        worlds = (world_of(scene, steps=50),) if found is None else found.corners
+        found = family_of_task(scenes, scene, "hall", _defaults)
+        worlds = (world_of(scene, _defaults),) if found is None else found.corners
         self.family, self.scene = found, worlds[0]
         self._most = (found or self.scene).n_anchors
         self.mode = check_one_of("mode", mode, SELECTIONS)
@@ -185,7 +190,8 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     for each chosen anchor.
 
     ## Episode end
-    Never terminates; truncates after 50 steps of 0.2 s.
+    Never terminates; truncates after 50 steps of 0.2 s. Other scenes have 50 steps, too, unless
+    they set `steps`.
 
     ## Info
     * `chosen` (12): the chosen anchors.

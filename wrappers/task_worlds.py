@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,14 +18,21 @@ LIMIT = 10.0
 _ITERATIONS = 2
 
 
-def world_of(scene: Any, **defaults: Any) -> Scene:
-    """Return the scene; `defaults` apply to fields that it does not set."""
+Defaults = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+
+def world_of(scene: Any, defaults: Defaults) -> Scene:
+    """Return the scene; `defaults` of its overrides apply to fields that it does not set."""
+    return scenes.get(_with(defaults, scene))
+
+
+def _with(defaults: Defaults, scene: Any) -> Any:
     changes = {"name": scene} if isinstance(scene, str) else scene
-    return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)
+    return {**defaults(changes), **changes} if isinstance(changes, Mapping) else changes
 
 
-def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> SceneFamily | None:
-    """Return the family of `scenes` (None without one); `defaults` apply to fields not set.
+def family_of_task(value: Any, scene: Any, usual: Any, defaults: Defaults) -> SceneFamily | None:
+    """Return the family of `scenes` (None without one); `defaults` as in `world_of`.
 
     Raises ValueError if it comes with a `scene` other than the `usual` one.
     """
@@ -33,8 +40,7 @@ def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> Scene
         return None
     if scene != usual:
         raise ValueError(f"scene must be left out if scenes is given, got {scene!r:.80}")
-    members = [{"name": one} if isinstance(one, str) else one for one in family(value).members]
-    return family([{**defaults, **one} if isinstance(one, Mapping) else one for one in members])
+    return family([_with(defaults, one) for one in family(value).members])
 
 
 class Usual:

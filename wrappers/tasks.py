@@ -23,6 +23,8 @@ from rbl_gym.wrappers.observations import ViewLike
 from rbl_gym.wrappers.rewards import RewardLike
 from rbl_gym.wrappers.task_worlds import LIMIT, Usual, family_of_task, world_of, worlds_of
 
+# The scene of the levels.
+_SCENE = "auv_craft"
 DIFFICULTIES: dict[str, dict[str, Any]] = {
     "easy": {"n_anchors": 3, "anchor_speed_m_s": 4.0},
     "hard": {"n_anchors": 2, "anchor_speed_m_s": 2.0},
@@ -45,10 +47,29 @@ class _MobileAnchors(Task):
 
     def _configure(self, difficulty: str, scene: Any, sort_craft: bool, scenes: Any) -> None:
         level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
-        found = family_of_task(scenes, scene, "auv_craft", **level)
-        worlds = (world_of(scene, **level),) if found is None else found.corners
-        if any(one.anchor_speed_m_s <= 0 for one in worlds):
-            raise ValueError("scene must have moving anchors, got anchor_speed_m_s = 0")
+        levelled = []
+
+        def defaults(changes: Mapping[str, Any]) -> dict[str, Any]:
+            if changes.get("name") != _SCENE:
+                return {}
+            levelled.append(changes)
+            # Positions of the anchors give their number.
+            stated = "anchors" in changes or "layout" in changes
+            return {key: level[key] for key in level if not (stated and key == "n_anchors")}
+
+        found = family_of_task(scenes, scene, _SCENE, defaults)
+        worlds = (world_of(scene, defaults),) if found is None else found.corners
+        if difficulty != "easy" and not levelled:
+            raise ValueError(
+                f"difficulty must be left out without the scene {_SCENE!r}, got {difficulty!r}: "
+                f"set n_anchors and anchor_speed_m_s in the scene"
+            )
+        for one in worlds:
+            if one.anchor_speed_m_s <= 0:
+                raise ValueError(
+                    f"scene must have moving anchors, got anchor_speed_m_s = 0 in {one.name!r}: "
+                    "set anchor_speed_m_s above 0"
+                )
         if not isinstance(sort_craft, bool):
             raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
         self.sort_craft = sort_craft
@@ -168,14 +189,14 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
 
     env = gym.make("rbl_gym:RBL/MobileAnchors-v0", difficulty="hard")
     ```
-    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move.
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move. The
+    `difficulty` gives the defaults of `n_anchors` and `anchor_speed_m_s` in ``"auv_craft"`` only.
 
     `scenes`: a family of scenes instead of `scene`, see `RBL/Tracking-v0`, for example
     ``scenes=[{"name": "auv_craft", "n_anchors": {"integers": [2, 5]}}]``. M is then the largest
-    number of craft. The `difficulty` gives the defaults of fields that a scene does not set.
-    Entries of missing craft are 0. The observation has 1 + M more entries: the longest distance
-    that a craft of the drawn scene can move in a step, divided by 10 m, and for each craft 1 if it
-    exists.
+    number of craft. Entries of missing craft are 0. The observation has 1 + M more entries: the
+    longest distance that a craft of the drawn scene can move in a step, divided by 10 m, and for
+    each craft 1 if it exists.
 
     `filter`, `options`, `reward`: as in `EstimatePose`. By default ``"iekf"`` has 2 iterations.
     `observation`: ``"flat"`` is the vector above. The other values are those of `EstimatePose`,
