@@ -110,6 +110,33 @@ def test_every_scene_can_be_rendered(scene):
     assert (env.render()[:, :576].min(axis=-1) < 250).mean() > 0.01
 
 
+def test_legends_and_the_path_keep_off_the_edges():
+    env = EstimatePose(make("Tracking", scene="auv_buoys", reward="none"), "iekf")
+    frame = rolled(env, steps=40)
+    dark = frame.min(axis=-1) < 230
+    legend = dark[510:535, :576]
+    assert legend.any()
+    assert not legend[:, :8].any()
+    assert not legend[:, -8:].any()
+    assert not dark[:5, 576:].any()
+    assert not dark[:265, -8:].any()
+
+
+def test_the_box_of_moving_anchors_fits_where_they_were():
+    env = make("MobileAnchors")
+    frame = rolled(env)
+    red = (frame[:500, :576] == (209, 73, 91)).all(axis=-1)
+    assert np.ptp(np.nonzero(red)[1]) > 100  # the region of the craft is six times as wide
+    shown = body._around(body._stage(SCENES["auv_craft"]), np.array([[-700.0, 0, 0], [700, 0, 0]]))
+    assert (shown.low[0], shown.high[0]) == (-600, 600)
+    shown = body._around(body._stage(SCENES["auv_craft"]), np.array([[-10.0, 5, 0], [160, 5, 0]]))
+    np.testing.assert_allclose(shown.low, (-150, 0, -80))
+    np.testing.assert_allclose(shown.high, (300, 150, 0))
+    # Obstacles stay inside the box.
+    hall = body._stage(SCENES["hall"])
+    assert body._around(hall, np.zeros((1, 3))) is hall
+
+
 def test_nothing_can_be_rendered_before_the_first_reset():
     with pytest.raises(gym.error.ResetNeeded, match="call reset"):
         make("Tracking").unwrapped.render()

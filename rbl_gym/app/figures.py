@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from rbl_gym.app.consistency import draw_nis
 from rbl_gym.app.reports import turn_open
@@ -79,9 +79,9 @@ def camsap2013_figure(result: dict[str, Any], example: Example) -> Figure:
 def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bool = True) -> None:
     """Draw RMSE of rotation and translation (Fig. 2), MAE (Fig. 3), mean NEES over the steps."""
     panels = (
-        ("rotation_rmse", "rotation RMSE (Frobenius)", "Fig. 2, rotation: "),
-        ("translation_rmse_m", "translation RMSE [m]", "Fig. 2, translation: "),
-        ("mean_angular_error_deg", "mean angular error [deg]", "Fig. 3: "),
+        ("rotation_rmse", "rotation RMSE (Frobenius)", "rotation, Fig. 2 of CAMSAP 2013: "),
+        ("translation_rmse_m", "translation RMSE [m]", "translation, Fig. 2 of CAMSAP 2013: "),
+        ("mean_angular_error_deg", "mean angular error [deg]", "angle, Fig. 3 of CAMSAP 2013: "),
         ("nees", "mean NEES", ""),
     )
     steps = np.arange(1, len(result["bound"]["rotation_rmse"]) + 1)
@@ -105,14 +105,16 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
             title = "grey: 95 % of a consistent filter, "
         else:
             ax.set_yscale("log")
-            for axis_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-                axis_formatter(ScalarFormatter())
+            ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_formatter(NullFormatter())
         ax.set(xlabel="time step", ylabel=label)
         ax.set_xticks([1, 5, 10, 15, 20])
         prefix = title if of_paper or key == "nees" else "tracking: "
         ax.set_title(f"{prefix}{result['trials']} trials")
         ax.grid(True, which="both")
     axes[0].legend(ncols=2)
+    axes[3].legend(ncols=2, loc="upper left")
     family = ", ".join(name for name in result["filters"] if name != "iterated EKF")
     axes[1].text(
         0.98,
@@ -202,7 +204,7 @@ def static_figure(result: dict[str, Any]) -> Figure:
     settings = result["settings"]
     figure = new_figure(3.4 * len(settings) + 1.2, 6.6)
     axes = figure.subplots(2, len(settings), squeeze=False, sharex=True)
-    _static_panels(axes, settings, ("Fig. 2: ", "Fig. 3: "))
+    _static_panels(axes, settings, ("Fig. 2, ICASSP 2013: ", "Fig. 3, ICASSP 2013: "))
     _common_legend(figure, axes)
     return figure
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -67,6 +68,21 @@ def _stage(scene: Scene, title: str | None = None) -> Stage:
     )
 
 
+def _around(stage: Stage, points: FloatArray) -> Stage:
+    """Return the stage with a smaller box, if the points (K, 3) use a small part of it.
+
+    A side keeps a multiple of an eighth of its length, so that the box rarely changes.
+    """
+    low, high = np.array(stage.low), np.array(stage.high)
+    step = np.maximum(high - low, 1e-9) / 8
+    first = np.clip(np.floor((np.nanmin(points, axis=0) - low) / step), 0, 7)
+    last = np.clip(np.ceil((np.nanmax(points, axis=0) - low) / step), first + 1, 8)
+    first[2], last[2] = 0, 8  # heights always show the ground
+    if max((last - first)[:2]) > 4 or len(stage.obstacles) or len(stage.prisms.corners):
+        return stage
+    return dataclasses.replace(stage, low=tuple(low + first * step), high=tuple(low + last * step))
+
+
 def shot(
     links: BoolArray,
     anchors: FloatArray,
@@ -97,7 +113,8 @@ def frame(
         headline += f"      error {errors[0, -1]:.3f} m, {errors[1, -1]:.2f}°"
     picture, left, upper, lower = panels.empty()
     path = np.array([shot.truth.translation[world] for shot in shots])
-    panels.world(stage).paint(path, last, shown, headline, left)
+    seen = [path, *(shot.anchors[world] for shot in shots)]
+    panels.world(_around(stage, np.concatenate(seen))).paint(path, last, shown, headline, left)
     panels.close_up(stage, source).paint(path, last.truth, belief, shown, upper)
     limits = tuple(limits_of(*both) for both in zip(bands, errors, strict=True))
     legend = "error" if source == "belief" else "", rf"3$\sigma$ of the {source}" if source else ""

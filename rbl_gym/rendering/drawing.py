@@ -181,7 +181,7 @@ def space(panel: Panel, area: tuple[float, float, float, float], low: Any, high:
     for name, middle, size in zip("xyz", 0.5 * (low + high), extent, strict=True):
         getattr(axes, f"set_{name}lim")(middle - 0.5 * size, middle + 0.5 * size)
         # Ticks at the corners of the box would overlap with those of the next axis.
-        few = max(3, round(6 * size / extent.max()))
+        few = max(2 if name == "z" else 3, round(6 * size / extent.max()))
         ticks = MaxNLocator(few, prune="lower" if name == "z" else "both")
         axis = getattr(axes, f"{name}axis")
         axis.set_major_locator(ticks)

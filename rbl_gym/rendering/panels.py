@@ -75,11 +75,11 @@ class _World:
                 [], [], color=ANCHOR, marker="^", ms=7, ls="", label="anchor (hollow: no range)"
             ),
             Line2D([], [], color=ANCHOR, lw=0.8, alpha=0.6, label="measures"),
-            Line2D([], [], color=INK, marker="o", ms=4.5, ls="", label="body, its axes enlarged"),
-            Line2D([], [], color="#495057", lw=1.3, label="path, its shadow"),
+            Line2D([], [], color=INK, marker="o", ms=4.5, ls="", label="body, enlarged axes"),
+            Line2D([], [], color="#495057", lw=1.3, label="path, shadow"),
         ]
         self.panel.figure.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 0.012),
-                                 ncols=4, columnspacing=1.4, handletextpad=0.5,
+                                 ncols=4, columnspacing=1.2, handletextpad=0.4, handlelength=1.5,
                                  **_LEGEND)  # fmt: skip
 
     def paint(
@@ -119,6 +119,8 @@ class _CloseUp:
     """The body at its true and its estimated pose, around its true position."""
 
     def __init__(self, stage: Stage, source: str) -> None:
+        from matplotlib.transforms import Bbox
+
         self.panel = panel = Panel(WIDTH - LEFT, TOP)
         self._tags = np.asarray(stage.tags)
         self._edges = body_edges(self._tags)
@@ -134,6 +136,8 @@ class _CloseUp:
         ruler.set_animated(False)
         panel.freeze()
         self._trail = panel.line(color="#adb5bd", lw=1.2)
+        # Between the legend and the ruler: a path is longer than the view.
+        self._trail.set_clip_box(Bbox([[12, 36], [WIDTH - LEFT - 12, TOP - 26]]))
         self._outline = panel.patch(fc=BELIEF, ec=BELIEF, lw=1.0, alpha=0.22)
         self._rings = panel.line(color=BELIEF, lw=0.8, alpha=0.8)
         self._body = panel.line(color=INK, lw=1.3)
