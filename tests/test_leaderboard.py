@@ -321,6 +321,16 @@ def test_a_filter_that_takes_no_such_law_and_one_without_a_pose_are_rows(tmp_pat
     assert "got [(6, 3, 3), (6, 3), (6, 3, 3)]" in room["message"]
 
 
+def test_the_table_of_stress_has_the_ratio_to_the_bound(tmp_path, short, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    bench(tmp_path, "--scenes", short, "--conditions", "nlos", "--filters", "iekf,kf",
+          "--json", tmp_path / "x.json")  # fmt: skip
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "nlos: tags (m), x bound, ANEES" in shown
+    for row in json.loads((tmp_path / "x.json").read_text())["rows"]:
+        assert f"{row['tags_m']['to_bound']:.3f}" in shown
+
+
 def test_event_triggered_filters_say_how_often(tmp_path, short):
     _, data = bench(tmp_path, "--scenes", short, "--conditions", "nominal",
                     "--filters", "kf,et-kf,et-kf/threshold=0,kf-ortho,iekf")  # fmt: skip

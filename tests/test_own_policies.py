@@ -108,6 +108,12 @@ def test_the_command_takes_a_function_of_a_module(tmp_path, monkeypatch, capsys)
         (lambda seen: np.ones((2, 5)), r"actions of shape \(2, 12\).*got \(2, 5\)$"),
         (lambda seen: np.full((2, 12), np.nan), "actions must be finite"),
         (3, "policy must be a file of rbl-gym train.*got 3"),
+        (
+            lambda a, b, c: a,
+            r"function of \(observation\) or \(env, observation\), but .*<lambda> has the "
+            r"arguments \(a, b, c\)",
+        ),
+        (lambda: 0, r"has the arguments \(\)"),
         ("no.such:function", "policy 'no.such:function' cannot be imported"),
         ({"random": all_alike}, "policy 'random' has the name of a reference"),
     ],

@@ -13,7 +13,7 @@ import pytest
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.metrics import Figures
-from rbl_gym.wrappers import EstimatePose
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from rbl_gym.wrappers.observations import Seen
 from rbl_gym.wrappers.rewards import REWARDS, Outcome, reward_of
 from tests.test_tracking_vector_env import ID, short
@@ -125,13 +125,35 @@ def test_wrong_rewards_are_named(reward, named):
 @pytest.mark.parametrize(
     ("reward", "named"),
     [
-        (lambda _: math.nan, "reward must be finite, got"),
+        (lambda _: math.nan, "reward .*<lambda> must be finite, got nan$"),
         (lambda _: np.zeros(2), r"one number for each world, shape \(\), got shape \(2,\)"),
+        (lambda _: None, r"reward .*<lambda> must return one number .* shape \(\), got None$"),
+        (lambda _: "high", "got 'high'$"),
     ],
 )
 def test_what_a_function_returns_is_checked(reward, named):
     with pytest.raises(ValueError, match=named):
         step_of(short("uwb_room", 4), reward)
+
+
+def one_nan(outcome):
+    return np.where(np.arange(3) == 1, math.nan, outcome.figures.score_m)
+
+
+@pytest.mark.parametrize(
+    ("reward", "named"),
+    [
+        (lambda _: 1.0, r"shape \(3,\), got shape \(\)\. .*\.mean\(axis=-1\)"),
+        (lambda _: None, r"shape \(3,\), got None$"),
+        (one_nan, "reward one_nan must be finite, got nan in 1 of 3 worlds, first world 1$"),
+    ],
+)
+def test_what_a_function_returns_for_many_worlds_is_checked(reward, named):
+    envs = gym.make_vec(ID, num_envs=3, scene=short("uwb_room", 4), reward="none")
+    envs = VectorEstimatePose(envs, "iekf", reward=reward)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=named):
+        envs.step(np.zeros(3, int))
 
 
 def test_every_name_is_documented():

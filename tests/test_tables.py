@@ -47,6 +47,22 @@ def test_a_table_by_rich_holds_the_same_text(capsys):
         assert text in shown
 
 
+@pytest.mark.parametrize("rich", [pytest.param(True, marks=needs("rich")), False])
+def test_a_piped_table_has_the_width_of_the_variable_columns(rich, capsys, monkeypatch, request):
+    if not rich:
+        request.getfixturevalue("without_rich")
+    wide = tables.new_table("wide", ["filter"], [f"figure {k}" for k in range(20)])
+    wide.add_row("iekf", *(f"{k}.12345678" for k in range(20)))
+    monkeypatch.setenv("COLUMNS", "80")
+    tables.new_console().print(wide)
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 80
+    assert all(f"{k}.12345678" in shown for k in range(20))
+    monkeypatch.delenv("COLUMNS")
+    tables.new_console(400).print(wide)
+    assert max(map(len, capsys.readouterr().out.splitlines())) > 200
+
+
 def test_a_plain_table_wider_than_the_terminal_is_split(without_rich, capsys, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "21")

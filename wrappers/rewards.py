@@ -167,12 +167,31 @@ def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
     one_world = isinstance(value, float) and isinstance(outcome.figures.score_m, float)
     if one_world and math.isfinite(value):
         return value
-    value = np.asarray(value, dtype=np.float64)
     shape = np.shape(outcome.figures.score_m)
+    wanted = f"reward {_label(reward)} must return one number for each world, shape {shape}"
+    try:
+        value = np.asarray(value if value is not None else "None", dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{wanted}, got {value!r:.80}") from None
     if value.shape != shape:
-        raise ValueError(
-            f"reward must return one number for each world, shape {shape}, got shape {value.shape}"
-        )
+        hint = ""
+        if shape and not value.shape:
+            hint = (
+                ". The arrays of the Outcome have the axis of the worlds first: reduce the other "
+                "axes only, for example with .mean(axis=-1)"
+            )
+        raise ValueError(f"{wanted}, got shape {value.shape}{hint}")
     if not all_finite(value):
-        raise ValueError(f"reward must be finite, got {value!s:.80}")
+        wrong = np.flatnonzero(~np.isfinite(value))
+        worlds = f" in {len(wrong)} of {value.size} worlds, first world {wrong[0]}" if shape else ""
+        raise ValueError(
+            f"reward {_label(reward)} must be finite, got {value.flat[wrong[0]]}{worlds}"
+        )
     return value
+
+
+def _label(reward: Any) -> str:
+    """Return the name of a reward for a message."""
+    while isinstance(reward, functools.partial):
+        reward = reward.args[0] if reward.func is _priced else reward.func
+    return str(getattr(reward, "__qualname__", type(reward).__qualname__))

@@ -11,7 +11,7 @@ from rbl_gym.studies.bench.leaderboard import is_recording
 
 _HEADINGS = (
     "position (m)", "rotation (deg)", "tags (m)", "median", "p95", "x bound", "ANEES", "lost",
-    "flipped", "worse than best, 95 %", "us / step",
+    "flipped", "worse than best (m), 95 %", "us / step",
 )  # fmt: skip
 # Beyond this number a column would contain only digits.
 _HUGE = 1e4
@@ -42,7 +42,7 @@ def print_bench(result: dict[str, Any]) -> None:
     console.print(
         "Root mean squares over trials and epochs; median, p95 and the columns after them are of "
         "the tag error.\nANEES per degree of freedom: 1 is consistent, + marks an optimistic and "
-        "- a pessimistic filter.\nTables of stress: tag RMSE (m), then ANEES, then trials lost."
+        "- a pessimistic filter.\nx bound: tag error divided by the bound; 1 is the best value."
     )
 
 
@@ -92,7 +92,11 @@ def _worse(ran: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str]) -> Any:
-    table = new_table(f"{scene}, stress", ["filter"], stress)
+    ratio = any("to_bound" in row.get("tags_m", {}) for rows in by_filter.values()
+                for row in rows.values())  # fmt: skip
+    parts = "tags (m), x bound, ANEES" if ratio else "tags (m), ANEES"
+    headings = [f"{condition}: {parts}" for condition in stress]
+    table = new_table(f"{scene}, stress", ["filter"], headings)
     order = "nominal" if any("nominal" in rows for rows in by_filter.values()) else stress[0]
     names = sorted(by_filter, key=lambda name: _tags(by_filter[name], order))
     columns = [_stress([by_filter[name][condition] for name in names]) for condition in stress]
@@ -103,10 +107,13 @@ def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str
 
 
 def _stress(rows: list[dict[str, Any]]) -> list[str]:
-    """Return a column: tag error, ANEES, lost trials; or why there are none."""
+    """Return a column: tag error, its ratio to the bound, ANEES, lost trials; or the status."""
     ran = [row for row in rows if "tags_m" in row]
-    pairs = zip(fixed([row["tags_m"]["rmse"] for row in ran]), _anees(ran), strict=True)
-    texts = iter([f"{error}  {honesty}" for error, honesty in pairs])
+    parts = [fixed([row["tags_m"]["rmse"] for row in ran])]
+    if any("to_bound" in row["tags_m"] for row in ran):
+        parts.append([_number(row["tags_m"].get("to_bound"), "{:.3f}") for row in ran])
+    parts = [[text.rjust(max(map(len, part))) for text in part] for part in (*parts, _anees(ran))]
+    texts = iter(["  ".join(cells) for cells in zip(*parts, strict=True)])
     return [
         row["status"]
         if "tags_m" not in row

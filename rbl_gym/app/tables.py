@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import textwrap
@@ -22,8 +23,8 @@ def new_console(width: int | None = 130) -> Any:
     """Return a console for standard output: rich's, or one that prints plain text."""
     if not has_rich():
         return _PlainConsole()
-    # Piped tables keep all of their columns.
-    width = None if rich_console().is_terminal else width
+    # Piped tables keep all of their columns, unless a width is requested.
+    width = None if rich_console().is_terminal or "COLUMNS" in os.environ else width
     return rich_console(width=width, highlight=False, markup=False)
 
 
@@ -69,10 +70,15 @@ class _PlainConsole:
 
     def print(self, *shown: Any, **_style: Any) -> None:
         """Print text or tables; text is wrapped at words on a terminal."""
-        if sys.stdout.isatty():
-            width = shutil.get_terminal_size().columns
+        if (width := _plain_width()) < sys.maxsize:
             shown = tuple(_wrapped(x, width) if isinstance(x, str) else x for x in shown)
         print(*shown)
+
+
+def _plain_width() -> int:
+    """Return the width of the terminal, or that of the variable COLUMNS; no limit without both."""
+    limited = sys.stdout.isatty() or "COLUMNS" in os.environ
+    return shutil.get_terminal_size().columns if limited else sys.maxsize
 
 
 def _wrapped(text: str, width: int) -> str:
@@ -102,7 +108,7 @@ class Table:
         self._rows.append(None)
 
     def __str__(self) -> str:
-        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+        width = _plain_width()
         widths = [max(map(len, self._cells(k))) for k in range(len(self._columns))]
         parts = [self._plain(part, widths) for part in self._parts(widths, width, 2)]
         return "\n".join([self._title, *parts] if self._title else parts)

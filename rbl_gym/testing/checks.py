@@ -50,6 +50,11 @@ from rbl_gym.testing.worlds import (
 __all__ = ["check_filter", "check_locator"]
 
 _EPOCHS, _TRIALS = 12, 64
+_NAN_ADVICE = (
+    ". Call check_prior in initial and check_epoch in update, both of rbl_gym.estimators.inputs, "
+    "and rbl_gym.checks.check_array in predict; or leave this check out: "
+    'check_filter(..., skip=["nan"])'
+)
 
 
 def check_filter(
@@ -271,7 +276,7 @@ def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
         ),
     }  # fmt: skip
     for name, (function, arguments, values) in calls.items():
-        check_refuses_nan(name, function, arguments, values)
+        check_refuses_nan(name, function, arguments, values, _NAN_ADVICE)
 
 
 def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:

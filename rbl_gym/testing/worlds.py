@@ -245,9 +245,13 @@ def check_links(estimate: Callable[[FloatArray, FloatArray, Any], Any], ranges: 
 
 
 def check_refuses_nan(
-    name: str, function: Callable[..., Any], arguments: Sequence[str], values: Sequence[Any]
+    name: str,
+    function: Callable[..., Any],
+    arguments: Sequence[str],
+    values: Sequence[Any],
+    advice: str = "",
 ) -> None:
-    """Check that NaN in any one of the arguments raises ValueError."""
+    """Check that NaN in any one of the arguments raises ValueError; `advice` ends the message."""
     for k, argument in enumerate(arguments):
         wrong = [np.array(value, dtype=np.float64) for value in values]
         wrong[k].flat[0] = math.nan
@@ -257,9 +261,11 @@ def check_refuses_nan(
             continue
         except Exception as error:
             raise AssertionError(
-                f"{name} must raise a ValueError on NaN in {argument}, raised {error!r}"
+                f"{name} must raise a ValueError on NaN in {argument}, raised {error!r}{advice}"
             ) from error
-        raise AssertionError(f"{name} must raise a ValueError on NaN in {argument}, raised nothing")
+        raise AssertionError(
+            f"{name} must raise a ValueError on NaN in {argument}, raised nothing{advice}"
+        )
 
 
 def check_nees(poses: Sequence[Any], rotation: FloatArray, translation: FloatArray) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -68,6 +69,22 @@ def _takes_env(act: Callable[..., Any]) -> bool:
     return sum(p.kind in by_position and p.default is p.empty for p in parameters) == 2
 
 
+def _check_arguments(act: Callable[..., Any]) -> None:
+    try:
+        signature = inspect.signature(act)
+    except (TypeError, ValueError):  # of some functions in C
+        return
+    for given in ("observation",), ("env", "observation"):
+        with contextlib.suppress(TypeError):
+            signature.bind(*given)
+            return
+    name = getattr(act, "__qualname__", type(act).__qualname__)
+    raise ValueError(
+        f"policy must be a function of (observation) or (env, observation), but {name} has the "
+        f"arguments {signature}"
+    )
+
+
 def _checked(actions: Any, env: Any) -> np.ndarray:
     """Return actions as an array; raises ValueError if they are not those of all worlds."""
     array, wanted = np.asarray(actions), env.action_space.shape
@@ -99,16 +116,20 @@ def policy_like(value: Any) -> PolicyLike:
     Raises
     ------
     ValueError
-        If it is none of these, the file is not a policy, or the function cannot be imported.
+        If it is none of these, the file is not a policy, or the function cannot be imported or
+        has other arguments.
     """
     if isinstance(value, Policy | SetPolicy | OwnPolicy):
         return value
     if isinstance(value, str | Path):
         text = str(value)
         if ":" in text and not text.endswith(".npz") and not Path(text).is_file():
-            return OwnPolicy(imported("policy", text))
+            return policy_like(imported("policy", text))
         return load(value)
-    if callable(value) or hasattr(value, "predict"):
+    if hasattr(value, "predict"):
+        return OwnPolicy(value)
+    if callable(value):
+        _check_arguments(value)
         return OwnPolicy(value)
     raise ValueError(
         "policy must be a file of rbl-gym train, 'module:function', a function or a model with "
