@@ -25,6 +25,7 @@ from rbl_gym.testing.worlds import (
     ANCHORS,
     DT,
     FIELDS,
+    NAN_ADVICE,
     NOISE,
     PROCESS,
     TAGS,
@@ -50,11 +51,6 @@ from rbl_gym.testing.worlds import (
 __all__ = ["check_filter", "check_locator"]
 
 _EPOCHS, _TRIALS = 12, 64
-_NAN_ADVICE = (
-    ". Call check_prior in initial and check_epoch in update, both of rbl_gym.estimators.inputs, "
-    "and rbl_gym.checks.check_array in predict; or leave this check out: "
-    'check_filter(..., skip=["nan"])'
-)
 
 
 def check_filter(
@@ -114,9 +110,8 @@ def _try_all(
     skip: Sequence[str],
     seed: int,
 ) -> None:
-    unknown = [name for name in skip if name not in checks]
-    if unknown:
-        raise ValueError(f"skip must be names of checks, {', '.join(checks)}; got {unknown[0]!r}")
+    for name in set(skip) - set(checks):
+        raise ValueError(f"skip must be names of checks, {', '.join(checks)}; got {name!r}")
     for name, check in checks.items():
         if name not in skip:
             check(subject, np.random.default_rng(seed))
@@ -276,7 +271,7 @@ def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
         ),
     }  # fmt: skip
     for name, (function, arguments, values) in calls.items():
-        check_refuses_nan(name, function, arguments, values, _NAN_ADVICE)
+        check_refuses_nan(name, function, arguments, values, NAN_ADVICE)
 
 
 def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:

@@ -42,6 +42,14 @@ class Epochs(NamedTuple):
     prior: tuple[FloatArray, FloatArray, FloatArray]
 
 
+# End of the message of a filter that accepts NaN.
+NAN_ADVICE = (
+    ". Call check_prior in initial and check_epoch in update, both of rbl_gym.estimators.inputs, "
+    "and rbl_gym.checks.check_array in predict; or leave this check out: "
+    'check_filter(..., skip=["nan"])'
+)
+
+
 def draw_epochs(
     rng: np.random.Generator, batch: tuple[int, ...], count: int, sensed: bool = False
 ) -> Epochs:
