@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ from rbl_gym.geometry.obstacles import Prisms
 from rbl_gym.placement import scene_files
 from rbl_gym.placement.file_lines import line_of
 from rbl_gym.placement.file_scenes import scene_of_file
+from rbl_gym.rendering import body
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose
 from tests.helpers import ROOT, needs
@@ -281,3 +283,81 @@ def test_prisms_are_equal_by_their_numbers():
     assert hash(one) == hash(same)
     assert one != other
     assert placement.task(WAREHOUSE).scene == placement.task(WAREHOUSE).scene
+
+
+# --- scene files ------------------------------------------------------------------------------
+
+ROOM = {
+    "name": "uwb_room",
+    "title": "my room",
+    "volume": {"low": [0.5, 0.5, 0.5], "high": [5.5, 4.5, 2.0]},
+    "anchors": [[0, 0, 2.4], [6, 0, 0.3], [6, 5, 2.4], [0, 5, 0.3], [3, 0, 2.4]],
+    "steps": 5,
+}
+
+
+def test_a_scene_file_is_the_scene_of_its_overrides(tmp_path):
+    path = tmp_path / "room.json"
+    path.write_text(json.dumps(ROOM))
+    made = scenes.get(ROOM)
+    assert (made.name, made.n_anchors, made.steps) == ("my room", 5, 5)
+    assert scenes.get(str(path)) == made
+    assert scenes.get({"name": str(path), "steps": 7}) == scenes.get({**ROOM, "steps": 7})
+    assert (
+        scenes.get({"name": str(path), "links": {"drop_probability": 0.2}}).anchors == made.anchors
+    )
+    toml = tmp_path / "hall.toml"
+    toml.write_text('name = "hall"\nsteps = 3\n')
+    assert scenes.get(str(toml)) == scenes.get({"name": "hall", "steps": 3})
+    for name, arguments in (("Tracking", {}), ("AnchorSelection", {"k": 2})):
+        env: Any = gym.make(f"rbl_gym:RBL/{name}-v0", scene=str(path), **arguments)
+        assert env.unwrapped.scene == made
+    path.write_text(json.dumps({"name": "auv_craft", "steps": 4}))
+    for text in (str(path), {"name": str(path)}):
+        env = gym.make("rbl_gym:RBL/MobileAnchors-v0", scene=text, difficulty="hard")
+        assert (env.unwrapped.scene.n_anchors, env.unwrapped.scene.steps) == (2, 4)
+    path.write_text(json.dumps(ROOM))
+    env = gym.make("rbl_gym:RBL/Tracking-v0", scenes=[str(path), str(path)])
+    env.reset(seed=1)
+    assert env.unwrapped.scene.name == "my room"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ({**ROOM, "anchor": 3}, "has no field 'anchor'"),
+        ({**ROOM, "title": 3}, "scene.title must be a text, got 3"),
+        ({**ROOM, "name": "my room"}, "must be one of 'uwb_room', "),
+        ({**ROOM, "name": "my room"}, "A world of your own changes the values of a named scene"),
+        (
+            {**ROOM, "name": "itself"},
+            "must be a named scene or a building file, got the scene file",
+        ),
+        (
+            {**ROOM, "anchor_speed_m_s": 1.0, "anchors": [[0, 0, 9.0]] * 5},
+            "anchors that move must start in anchor_region, but anchors[0] is 6 m outside",
+        ),
+    ],
+)
+def test_errors_of_a_scene_file_name_the_file_and_the_field(text, message, tmp_path):
+    path = tmp_path / "room.json"
+    if text["name"] == "itself":
+        text = {**text, "name": str(path)}
+    path.write_text(json.dumps(text))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        scenes.get(str(path))
+    assert str(path) in str(caught.value)
+
+
+def test_a_picture_has_the_title_and_the_room_of_the_scene():
+    stage = body._stage(scenes.get(ROOM))
+    assert stage.name == "my room"
+    assert (stage.low, stage.high) == ((0, 0, 0.3), (6, 5, 2.4))
+    moving = {
+        **ROOM,
+        "anchor_speed_m_s": 1.0,
+        "anchor_region": {"kind": "box", "low": [0, 0, 0], "high": [6, 5, 3]},
+    }
+    assert body._stage(scenes.get(moving)).high == (6, 5, 3)
+    racks = scenes.get({**ROOM, "obstacles": [[3, 2, 1, 0.5, 0.5, 1]]})
+    assert body._stage(racks).low == (0, 0, 0)

@@ -10,6 +10,7 @@ import numpy as np
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.worlds.scene_source import changes_in
 from rbl_gym.wrappers.estimate import FilterLike, check_options_of, named_filter
 
 # Observations are of order one. Values far outside carry no more information.
@@ -28,7 +29,13 @@ def world_of(scene: Any, defaults: Defaults) -> Scene:
 
 def _with(defaults: Defaults, scene: Any) -> Any:
     changes = {"name": scene} if isinstance(scene, str) else scene
-    return {**defaults(changes), **changes} if isinstance(changes, Mapping) else changes
+    if not isinstance(changes, Mapping):
+        return changes
+    name = changes.get("name")
+    file = changes_in(name) if isinstance(name, str) else None
+    told = changes if file is None else {**file, **changes, "name": file["name"]}
+    usual = defaults(told)
+    return {**{key: usual[key] for key in usual if key not in told}, **changes}
 
 
 def family_of_task(value: Any, scene: Any, usual: Any, defaults: Defaults) -> SceneFamily | None:

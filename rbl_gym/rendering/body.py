@@ -53,9 +53,14 @@ def _frame_of_many(
 
 
 def _stage(scene: Scene, title: str | None = None) -> Stage:
-    corners = [*scene.volume.bounds(), *scene.anchor_region.bounds()]
+    corners = [*scene.volume.bounds()]
     if scene.anchors is not None:
         corners += list(np.asarray(scene.anchors))
+    # Fixed anchors at given positions do not need their region.
+    if scene.anchors is None or scene.anchor_speed_m_s > 0 or scene.prisms:
+        corners += [*scene.anchor_region.bounds()]
+    for box in np.reshape(scene.obstacles, (-1, 2, 3)):
+        corners += [box[0] - box[1], box[0] + box[1]]
     return Stage(
         title or scene.name,
         tuple(np.min(corners, axis=0)),

@@ -73,7 +73,7 @@ class Scene:
     Parameters
     ----------
     name
-        Name in the registry.
+        Name in the registry, or the title of pictures.
     volume
         Region in which the body moves.
     anchor_region, n_anchors, anchors
@@ -225,8 +225,9 @@ class Scene:
             moved = np.abs(legal - anchors)
             if moved.max() > 1e-6:
                 raise ValueError(
-                    f"anchors that move must start in their region, got one {moved.max():g} m "
-                    f"outside, anchors[{int(moved.max(axis=1).argmax())}]"
+                    "anchors that move must start in anchor_region, but "
+                    f"anchors[{int(moved.max(axis=1).argmax())}] is {moved.max():g} m outside: "
+                    "change anchors or anchor_region"
                 )
         reference = getattr(self.noise, "reference_tag", None)
         if reference is not None and not 0 <= reference < len(self.tags):

@@ -59,7 +59,7 @@ def read_scene(name: str) -> Any:
     if not name.endswith(SUFFIXES):
         return name
     found = _parsed(name)
-    if isinstance(found, Mapping) and "body" in found:
+    if isinstance(found, Mapping) and _is_building(found):
         return name
     if isinstance(found, Mapping) and "name" in found:
         return dict(found)
@@ -67,6 +67,39 @@ def read_scene(name: str) -> Any:
         f"{name} must hold a table with the key 'name' (changes of a scene) or 'body' (a "
         f"building file), got {found!r:.80}"
     )
+
+
+def changes_in(path: str) -> dict[str, Any] | None:
+    """Return the overrides in a scene file; None for any other file, such as a building file.
+
+    Raises
+    ------
+    ValueError
+        If the scene file changes another scene file.
+    """
+    found = _changes(path)
+    name = None if found is None else found["name"]
+    if isinstance(name, str) and name.endswith(SUFFIXES) and _changes(name) is not None:
+        raise ValueError(
+            f"{path}: name must be a named scene or a building file, got the scene file {name!r}"
+        )
+    return found
+
+
+def _changes(path: str) -> dict[str, Any] | None:
+    try:
+        found = _parsed(path)
+    except (OSError, ValueError, RecursionError):
+        # The reader of building files describes the error.
+        return None
+    if not isinstance(found, Mapping) or "name" not in found or _is_building(found):
+        return None
+    return dict(found)
+
+
+def _is_building(found: Mapping[str, Any]) -> bool:
+    """Return whether a file has a table that only building files have."""
+    return any(isinstance(found.get(key), dict | list) for key in ("body", "region", "zones"))
 
 
 def _parsed(path: str | Path) -> Any:

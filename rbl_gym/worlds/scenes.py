@@ -18,7 +18,7 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
 from rbl_gym.motion.kinematics import ProcessNoise
-from rbl_gym.worlds import overrides
+from rbl_gym.worlds import overrides, scene_source
 from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SCENES", "get"]
@@ -210,8 +210,10 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
           anchor region.
         * ``"stretch": [x, y, z]`` multiplies the volume, the anchor region (box or walls), the
           anchors and the obstacles by a factor for each axis, after all other changes.
-        * A ``"name"`` that ends in ``.toml`` or ``.json`` is the path of a building file
-          (docs/building_files.md), see `rbl_gym.placement.file_scenes.scene_of_file`.
+        * A ``"name"`` that ends in ``.toml`` or ``.json`` is the path of a file: overrides with the
+          key ``"name"`` of a named scene, or a building file (docs/building_files.md), see
+          `rbl_gym.placement.file_scenes.scene_of_file`.
+        * ``"title"`` is a name of your own, for pictures.
         * ``"layout": "layout.csv"`` reads the anchor positions from a file of ``rbl-gym place``.
 
     Raises
@@ -225,8 +227,11 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     if isinstance(scene, str):
         scene = {"name": scene}
     if not isinstance(scene, Mapping) or "name" not in scene:
-        raise ValueError(f"scene must be a name or a dict with the key 'name', got {scene!r:.120}")
-    special = ("name", "stretch", "layout")
+        raise ValueError(
+            f"scene must be a name or a dict with the key 'name', got {scene!r:.120}; the name is "
+            "the scene whose values the dict changes, such as {'name': 'uwb_room', 'steps': 50}"
+        )
+    special = ("name", "title", "stretch", "layout")
     changes = {key: value for key, value in scene.items() if key not in special}
     base = _named(scene["name"])
     if "layout" in scene:
@@ -242,6 +247,11 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         changes.setdefault("fixed", ())
         changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
     made = overrides.replace(base, changes, "scene", special)
+    if "title" in scene:
+        title = scene["title"]
+        if not isinstance(title, str) or not title:
+            raise ValueError(f"scene.title must be a text, got {title!r:.80}")
+        made = dataclasses.replace(made, name=title)
     return _stretched(made, scene["stretch"]) if "stretch" in scene else made
 
 
@@ -249,11 +259,18 @@ def _named(name: Any) -> Scene:
     """Return a scene by its name or by the path of its file."""
     suffix = PurePath(name).suffix.lower() if isinstance(name, str) else ""
     if suffix in READERS and name not in SCENES:
-        return imported("scene", READERS[suffix])(name)
+        changes = scene_source.changes_in(name)
+        if changes is None:
+            return imported("scene", READERS[suffix])(name)
+        try:
+            return get(changes)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
     if not isinstance(name, str) or name not in SCENES:
         raise ValueError(
             f"scene must be one of {', '.join(map(repr, SCENES))}, or a .toml or .json file; got "
-            f"{name!r:.80}{did_you_mean(name, SCENES)}"
+            f"{name!r:.80}{did_you_mean(name, SCENES)}. A world of your own changes the values of "
+            "a named scene: {'name': 'uwb_room', 'title': 'my room', ...}"
         )
     return SCENES[name]
 
