@@ -266,6 +266,17 @@ def test_environment_that_hides_its_measurements_is_named():
         EstimatePose(FlattenObservation(raw("uwb_room")))
 
 
+def test_a_task_with_its_own_filter_needs_no_wrapper():
+    for name in ("MobileAnchors", "AnchorSelection"):
+        env = gym.make(f"rbl_gym:RBL/{name}-v0")
+        message = f"must not run a filter already, got {name}Env: .*pass filter=.* to gym.make"
+        with pytest.raises(ValueError, match=message):
+            EstimatePose(env)
+        envs = gym.make_vec(f"rbl_gym:RBL/{name}-v0", num_envs=2)
+        with pytest.raises(ValueError, match="must not run a filter already"):
+            VectorEstimatePose(envs)
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

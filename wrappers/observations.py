@@ -222,6 +222,11 @@ class Viewer:
         keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
         needed = {"angles", "station"} if "angles" in keys else {"ranges", "links", "anchors"}
         if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
+            if getattr(env.unwrapped, "inner", None) is not None:
+                raise ValueError(
+                    f"env must not run a filter already, got {env.unwrapped.__class__.__name__}: "
+                    "leave out the wrapper, and pass filter=, options= and reward= to gym.make"
+                )
             raise ValueError(
                 "env must observe ranges, links, anchors and twist, or angles, station and "
                 f"twist, got the space {inner}"
