@@ -71,11 +71,11 @@ def test_actions_are_in_the_order_of_the_observation(sort):
     """A command for a craft by its number reaches that craft, whatever the order."""
     env = MobileAnchorsVectorEnv(6, sort_craft=sort)
     env.reset(seed=2)
-    before = env.inner_observation["anchors"].copy()
+    before = env._last_observation()["anchors"].copy()
     velocity = np.zeros((6, 3, 2))
     velocity[:, 1] = [0.6, -0.8]
     env.step(controllers._ordered(env, velocity))
-    moved = (env.inner_observation["anchors"] - before)[..., :2]
+    moved = (env._last_observation()["anchors"] - before)[..., :2]
     np.testing.assert_allclose(moved, 8 * velocity, atol=1e-9)
 
 
@@ -88,7 +88,7 @@ def test_ring_and_orbit_reach_their_radius_and_angles(difficulty, name):
     rng, angles = np.random.default_rng(1), []
     for _ in range(99):
         truth = env.step(controllers.MOBILE[name](env, rng))[4]["translation"]
-        gap = env.inner_observation["anchors"][..., :2] - truth[:, None, :2]
+        gap = env._last_observation()["anchors"][..., :2] - truth[:, None, :2]
         angles.append(np.sort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1))
     pair = difficulty == "hard"
     depths = getattr(controllers, f"{'PAIR_' if pair else ''}{name.upper()}_DEPTHS")
@@ -138,7 +138,7 @@ def test_a_plan_costs_the_mean_log_score_along_it():
     for world, sample in itertools.product(range(2), (0, 4)):
         pose = env.belief.rotation[world], env.belief.translation[world]
         twist, covariance = env.twist[world], env.belief.covariance[world]
-        anchors, cost = env.inner_observation["anchors"][world].copy(), 0.0
+        anchors, cost = env._last_observation()["anchors"][world].copy(), 0.0
         for step in plans[world, sample]:
             anchors[:, :2] += 8 * step
             pose = motion.propagate(*pose, twist, 2.0)

@@ -309,7 +309,8 @@ def test_a_scene_file_is_the_scene_of_its_overrides(tmp_path):
     toml = tmp_path / "hall.toml"
     toml.write_text('name = "hall"\nsteps = 3\n')
     assert scenes.get(str(toml)) == scenes.get({"name": "hall", "steps": 3})
-    for name, arguments in (("Tracking", {}), ("AnchorSelection", {"k": 2})):
+    kinds: dict[str, dict[str, Any]] = {"Tracking": {}, "AnchorSelection": {"k": 2}}
+    for name, arguments in kinds.items():
         env: Any = gym.make(f"rbl_gym:RBL/{name}-v0", scene=str(path), **arguments)
         assert env.unwrapped.scene == made
     path.write_text(json.dumps({"name": "auv_craft", "steps": 4}))

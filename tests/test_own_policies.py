@@ -183,8 +183,8 @@ def test_a_model_of_stable_baselines3():
 )
 def test_a_policy_of_craft_needs_only_the_anchors_and_the_belief(arguments):
     """Entries of actions and anchors belong to the same craft, in any order of the craft."""
-    env = gym.make("rbl_gym:RBL/MobileAnchors-v0", **arguments)
-    envs = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=6, **arguments)
+    env: Any = gym.make("rbl_gym:RBL/MobileAnchors-v0", **arguments)
+    envs: Any = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=6, **arguments)
     for one, batch in ((env.unwrapped, ()), (envs.unwrapped, (6,))):
         one.reset(seed=2)
         before = one.anchors
@@ -219,7 +219,7 @@ def test_the_policy_of_the_page_is_as_good_as_the_orbit():
     """It is the orbit without the prediction of one step: within 0.05 of its mean log b."""
     losses = {}
     for name in ("mine", "orbit", "random"):
-        env = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=16).unwrapped
+        env: Any = gym.make_vec("rbl_gym:RBL/MobileAnchors-v0", num_envs=16).unwrapped
         seen, _ = env.reset(seed=3)
         rng, total = np.random.default_rng(0), 0.0
         for _ in range(40):

@@ -137,7 +137,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
             step = action[2 * j : 2 * j + 2]
             twin.anchors[i, :2] += 2.0 * speed * step / max(1.0, np.linalg.norm(step))
         observation, reward, _, _, info = env.step(action)
-        np.testing.assert_allclose(env.inner_observation["anchors"], twin.anchors, atol=1e-9)
+        np.testing.assert_allclose(env._last_observation()["anchors"], twin.anchors, atol=1e-9)
         twin.predict(k)
         twin.update(k)
         np.testing.assert_allclose(reward, -math.log(twin.score()), rtol=1e-6)
@@ -250,7 +250,7 @@ def test_any_filter_by_a_plain_loop(env_id, filter, options):
     for k in range(1, 9):
         action = rng.uniform(-1, 1, env.action_space.shape)
         _, reward, _, _, info = env.step(action)
-        twin.anchors = env.inner_observation["anchors"].copy()
+        twin.anchors = env._last_observation()["anchors"].copy()
         twin.predict(k)
         twin.update(k, np.argsort(action)[-3:] if env_id == SELECTION else None)
         np.testing.assert_allclose(reward, -math.log(twin.score()), rtol=1e-6)
@@ -311,7 +311,7 @@ def test_craft_numbers_change_nothing_when_sorted(sort):
     assert np.array_equal(env._task_view(seen, env.scene), env._task_view(other, env.scene)) is sort
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 8))
     env.step(actions)
-    moved = env.inner_observation["anchors"]
+    moved = env._last_observation()["anchors"]
     env.reset(seed=3)
     env.inner_observation = other
     env._task_view(other, env.scene)
@@ -329,16 +329,16 @@ def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
     env.reset(seed=1)
     rng = np.random.default_rng(1)
     for _ in range(20):
-        before = env.inner_observation["anchors"].copy()
+        before = env._last_observation()["anchors"].copy()
         actions = rng.uniform(-2, 2, (16, 4))
         wanted = np.linalg.norm(actions.reshape(16, 2, 2), axis=-1).clip(max=1)
         order = env.order.copy()
         env.step(actions)
-        moved = np.linalg.norm(env.inner_observation["anchors"] - before, axis=-1)
+        moved = np.linalg.norm(env._last_observation()["anchors"] - before, axis=-1)
         np.testing.assert_allclose(
             np.take_along_axis(moved, order, axis=1), 2.0 * 2.0 * wanted, rtol=1e-9
         )
-        assert not env.inner_observation["anchors"][..., 2].any()
+        assert not env._last_observation()["anchors"][..., 2].any()
 
 
 # --- consistency ------------------------------------------------------------------------------
