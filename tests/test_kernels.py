@@ -73,7 +73,7 @@ def test_the_command_line_says_once_that_kernels_compile(capsys, caplog, monkeyp
     said = capsys.readouterr()
     assert said.out == ""
     (line,) = said.err.splitlines()
-    assert line.startswith("rbl-gym: compiling kernels, once after an installation")
+    assert line.startswith("rbl-gym: compiling kernels, up to a minute; later runs")
 
 
 def test_without_kernels_the_textbook_form_runs(monkeypatch):

@@ -34,7 +34,7 @@ _LOG = logging.getLogger("rbl_gym.kernels")
 @functools.cache
 def _announce() -> None:
     """Log, once in a process, that kernels compile."""
-    _LOG.info("compiling kernels, once after an installation; this can take a minute")
+    _LOG.info("compiling kernels, up to a minute; later runs of this command load them")
 
 
 class _Passes(event.Listener):
