@@ -266,6 +266,25 @@ def test_clock_with_lost_and_late_ranges_where_the_body_faces_its_way(lasts_s, p
     assert np.square(z).sum() < scipy.stats.chi2.ppf(0.9999, len(z))
 
 
+def test_a_truth_that_repeats_a_pose_and_jumps_does_not_tell_the_clock():
+    """A tracker lost the body for 0.44 s. What it repeated is interpolated."""
+    times, on_truth = 0.05 * np.arange(600), 0.01 * np.arange(3100)
+    ranges = ranges_of(times, np.random.default_rng(4))
+    truth = Truth(on_truth + 0.3, *path_of(on_truth))
+    held = np.arange(3100)
+    held[1500:1544] = 1500
+    frozen = Truth(truth.times, truth.rotation[held], truth.translation[held])
+    settings = LinkSettings(tags="held")
+    whole, found = (
+        calibrate.calibrate_links(recording_of(times, ranges, one), settings).clock
+        for one in (truth, frozen)
+    )
+    assert whole is not None
+    assert found is not None
+    assert abs(found.offset_s - whole.offset_s) < 0.2 * whole.std_s
+    assert found.std_s == pytest.approx(whole.std_s, rel=0.2)
+
+
 @pytest.mark.parametrize("slopes", [True, False])
 def test_swapped_axes_of_the_anchors_are_refused(slopes):
     times = 0.1 * np.arange(300)
@@ -383,8 +402,8 @@ def test_a_real_recording_at_a_third_of_its_rate():
     found = calibrate.calibrate_links(thin, LinkSettings(planar=True))
     assert found.clock is not None
     # Turns of the whole table look alike: the clock is known to some hundredths of a second.
-    assert found.clock.std_s < 0.05
-    assert abs(found.clock.offset_s - 0.03) < 3 * found.clock.std_s
+    assert found.clock.std_s < 0.1
+    assert abs(found.clock.offset_s - 0.03) < 2 * found.clock.std_s
     assert found.figures["turn"]["rotation_vector_deg"][2] == pytest.approx(7, abs=1)
     assert found.figures["noise"]["std_m"] == pytest.approx(0.058, abs=0.008)
     assert found.fit.bias_m.mean() == pytest.approx(0.12, abs=0.03)

@@ -52,8 +52,7 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
     """
     if not recordings:
         raise ValueError("recordings must hold a run, got none")
-    runs = tuple(recordings.values())
-    first = runs[0]
+    first = next(iter(recordings.values()))
     for name, run in recordings.items():
         label = f"run {name!r}: " if name else ""
         if run.anchor_ids != first.anchor_ids or run.tag_ids != first.tag_ids:
@@ -78,6 +77,11 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
                     f"heights, and the anchors are at heights of "
                     f"{heights.min():g} to {heights.max():g} m"
                 )
+    runs = tuple(
+        run._replace(truth=_without_repeats(run.truth, settings.truth_gap_s))
+        for run in recordings.values()
+        if run.truth is not None
+    )
     times = np.concatenate([run.times for run in runs])
     out = np.zeros(len(times), dtype=bool)
     for start, end in settings.truth_exclude:
@@ -89,6 +93,25 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
         np.concatenate([run.links for run in runs]) & ~out[:, None, None],
         np.concatenate([run.anchors_by_epoch for run in runs]),
         first.tags,
+    )
+
+
+def _without_repeats(truth: Truth, longest_s: float) -> Truth:
+    """Return the truth without the repeats of poses that stay the same for at most `longest_s`.
+
+    A tracker that loses its markers may repeat its last pose. The body moves on, so the poses
+    between are interpolated. If the body rests, this changes little.
+    """
+    values = truth.translation
+    if truth.rotation is not None:
+        values = np.column_stack([values, truth.rotation.reshape(-1, 9)])
+    new = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))
+    since = truth.times[new]
+    lasts_s = np.append(np.diff(since), np.inf)[np.cumsum(new) - 1]
+    kept = new | (lasts_s > longest_s)
+    rotation = None if truth.rotation is None else truth.rotation[kept]
+    return truth._replace(
+        times=truth.times[kept], rotation=rotation, translation=truth.translation[kept]
     )
 
 
