@@ -46,7 +46,7 @@ def test_columns_are_mapped_and_others_are_named_once(tmp_path):
 def test_a_column_that_is_mapped_and_not_there(tmp_path):
     with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'to' for anchor"):
         read_as(tmp_path, LONG, columns={"anchor": "to"})
-    with pytest.raises(ValueError, match=r"missing column 't', .*; if it .* --columns t=NAME$"):
+    with pytest.raises(ValueError, match=r"missing column 't', .*; if it .* --columns time=NAME$"):
         read(tmp_path, LONG.replace("t,", "when,", 1))
     message = r"anchors.csv, line 1: missing columns 'x', 'y', 'z', got .* "
     names = "anchors.x=NAME,anchors.y=NAME,anchors.z=NAME"
@@ -140,7 +140,7 @@ def test_unit_of_the_times_of_a_truth(tmp_path, unit, scale):
     np.testing.assert_allclose(log.truth.times, np.arange(30), atol=1e-9)
     notes = [note for note in log.report.notes if "span about as long as the ranges" in note]
     assert len(notes) == (unit != "s")
-    assert all("set --columns truth.t=t[s]" in note for note in notes)
+    assert all("set --columns truth.time=t[s]" in note for note in notes)
     # A truth of one hour at 100 Hz contains a short log.
     rows = [f"{0.01 * k:.2f},{k},0,0" for k in range(0, 360_000, 1000)]
     rows = [*rows[:1], *(f"{0.01 * k:.2f},{k},0,0" for k in range(1, 500)), *rows[1:]]

@@ -176,7 +176,7 @@ ERRORS = {
     "utf-16": ({"tags": TAGS.encode("utf-16")}, r"tags.csv: must be UTF-8 text"),
     "zeros": (
         {"ranges": b"\0\0\0\n\0"},
-        r"ranges.csv, line 1: no column of ranges found.* --columns t=NAME,",
+        r"ranges.csv, line 1: no column of ranges found.* --columns time=NAME,",
     ),
     "open quote": ({"tags": TAGS + '"3,0,0,0\n'}, r"tags.csv, line \d: unexpected end of data"),
     "ragged": ({"ranges": LONG + "0.2,A,1\n"}, r"ranges.csv, line 6: must have 4 .*, got 3"),

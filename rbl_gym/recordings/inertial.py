@@ -11,12 +11,12 @@ import numpy as np
 from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements.inertial import GRAVITY_M_S2
-from rbl_gym.recordings.tables import AnyPath, Source, read_table
+from rbl_gym.recordings.column_units import TURN_UNITS
+from rbl_gym.recordings.tables import AnyPath, Source, Table, read_table
 
 __all__ = ["InertialLog", "read_frame", "read_inertial", "samples_between"]
 
 _COLUMNS = ("t", "wx", "wy", "wz", "ax", "ay", "az")
-TURN_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 FORCE_UNITS = {"m/s^2": 1.0, "g": GRAVITY_M_S2}
 # Upper limit of turn rates, and limits of the median specific force under gravity.
 _MAX_RATE, _FORCE = 150.0, (0.3, 4.0)
@@ -47,7 +47,8 @@ def read_inertial(
     columns
         Names used here to names in the file, if they differ: ``{"wx": "gyro_x"}``.
     turn_unit, force_unit
-        Units of the file, ``"rad/s"`` or ``"deg/s"``, and ``"m/s^2"`` or ``"g"``.
+        Units of the columns that do not state theirs, as in ``gyro_x [deg/s]``: ``"rad/s"`` or
+        ``"deg/s"``, and ``"m/s^2"`` or ``"g"``.
 
     Raises
     ------
@@ -55,15 +56,17 @@ def read_inertial(
         If a cell is not a number or times do not increase (the message names file, line and
         column), a column does not exist, or the readings cannot be in these units.
     """
-    turn = TURN_UNITS[check_one_of("turn_unit", turn_unit, list(TURN_UNITS))]
-    force = FORCE_UNITS[check_one_of("force_unit", force_unit, list(FORCE_UNITS))]
+    check_one_of("turn_unit", turn_unit, list(TURN_UNITS))
+    check_one_of("force_unit", force_unit, list(FORCE_UNITS))
     for name in columns or {}:
-        check_one_of("columns", name, list(_COLUMNS))
+        check_one_of("columns", name, [*_COLUMNS, "time"])
     table = read_table(path, Source(dict(columns or {}), file="imu"))
     table.require(*_COLUMNS)
     times = table.times()
     values = [table.numbers(name) for name in _COLUMNS[1:]]
-    readings = np.stack(values, axis=-1) * np.repeat([turn, force], 3)
+    scales = [rate_unit(table, name, TURN_UNITS, turn_unit) for name in _COLUMNS[1:4]]
+    scales += [rate_unit(table, name, FORCE_UNITS, force_unit) for name in _COLUMNS[4:]]
+    readings = np.stack(values, axis=-1) * scales
     fastest = float(np.quantile(np.linalg.norm(readings[:, :3], axis=-1), 0.99))
     if fastest > _MAX_RATE:
         raise ValueError(
@@ -78,6 +81,14 @@ def read_inertial(
             f"{'in g, or was gravity removed' if usual < 1 else 'in m/s^2'}?)"
         )
     return InertialLog(times, readings)
+
+
+def rate_unit(table: Table, column: str, units: Mapping[str, float], usual: str) -> float:
+    """Return the scale of a column by the unit in brackets after its name, else by `usual`."""
+    told = table.units.get(column, "")
+    # speed_ms and gyro_s are not milliseconds and seconds.
+    plain = table.name(column).endswith(f"_{told}")
+    return units[usual if plain else table.unit(column, units) or usual]
 
 
 def read_frame(told: AnyPath) -> FloatArray:

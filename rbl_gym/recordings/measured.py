@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.recordings.column_units import name_and_unit
 from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.points import Points
 from rbl_gym.recordings.report import Said
@@ -169,7 +170,7 @@ def _read_wide(
             f"{table.path}: give the positions of the anchors (--anchors), which a table with a "
             "column for each link does not have"
         )
-    pattern = columns.get("range", _WIDE)
+    pattern = name_and_unit(columns.get("range", _WIDE))[0]
     links, ids = _links_of(table, pattern, anchors.ids, None if tags is None else tags.ids)
     names = list(links)
     if not names:
@@ -189,7 +190,7 @@ def _read_wide(
     values = scale * np.stack([table.numbers(n, may_be_missing=True) for n in names], axis=1)
     std, std_names = None, []
     if "std" in columns:
-        place = _links_of(table, columns["std"], *ids)[0]
+        place = _links_of(table, name_and_unit(columns["std"])[0], *ids)[0]
         by_link = {link: name for name, link in place.items()}
         std_names = [by_link.get(link, "") for link in links.values()]
         if "" in std_names:
@@ -199,7 +200,7 @@ def _read_wide(
                 f"column of standard deviations like {columns['std']!r}, got none"
             )
         std = np.stack([table.numbers(n, may_be_missing=True) for n in std_names], axis=1)
-        std = scale * std.ravel()
+        std = (METRES[table.unit("std", METRES)] if table.units.get("std") else scale) * std.ravel()
     said.read(table, {"t", "run", *names, *std_names})
     where = np.array([*links.values()], dtype=np.intp)
     measured = Measured(

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import FloatArray, check_number, check_one_of
-from rbl_gym.recordings.inertial import TURN_UNITS
+from rbl_gym.recordings.column_units import METRES, SPEEDS, TURN_UNITS
+from rbl_gym.recordings.inertial import rate_unit
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import AS_NAMED, AnyPath, Source, Table, read_table
 
@@ -53,7 +54,8 @@ def read_odometry(
         Distance between the wheels or tracks with the speeds `left` and `right`, metres; or use the
         column `width`. The turn rate is ``(right - left) / width``.
     turn_unit
-        Unit of turn rates in the file, ``"rad/s"`` or ``"deg/s"``.
+        Unit of turn rates in the file, ``"rad/s"`` or ``"deg/s"``; a unit in brackets after the
+        name of a column comes first: ``speed [mm/s]``, ``{"wz": "gyro[deg/s]"}``.
 
     Raises
     ------
@@ -61,9 +63,9 @@ def read_odometry(
         If a cell is not a number or times decrease (the message names file, line and column), a
         column does not exist, or the readings cannot be in these units.
     """
-    unit = TURN_UNITS[check_one_of("turn_unit", turn_unit, list(TURN_UNITS))]
+    check_one_of("turn_unit", turn_unit, list(TURN_UNITS))
     said = said or Said()
-    table = read_table(path, source)
+    table = read_table(path, source._replace(file="odometry"))
     times, note = table.seconds()
     said.note(table.path, note)
     later = np.diff(times, prepend=-np.inf)
@@ -71,7 +73,7 @@ def read_odometry(
     if any(name in table.columns for name in _WHEELS):
         readings, names = _of_wheels(table, wheelbase_m)
     else:
-        readings, names = _of_axes(table, unit)
+        readings, names = _of_axes(table, turn_unit)
         if wheelbase_m is not None:
             raise ValueError(
                 f"{table.path}: wheelbase_m must be left out without the columns left and right"
@@ -86,13 +88,15 @@ def read_odometry(
             "deg/s? set turn_unit to deg/s; or is wheelbase_m not in metres?)"
         )
     if most[3:].max() > _MAX_SPEED:
+        told = {name: f"{table.name(name)}[mm/s]" for name in names if name[0] in "vlr"}
         raise ValueError(
-            f"{table.path}: speeds of {most[3:].max():.3g} m/s are too large (are they in mm/s?)"
+            f"{table.path}: speeds of {most[3:].max():.3g} m/s are too large (are they in mm/s? "
+            f'then give --columns "{table.source.given(**told)}")'
         )
     return OdometryLog(times[later > 0], readings[later > 0])
 
 
-def _of_axes(table: Table, unit: float) -> tuple[FloatArray, tuple[str, ...]]:
+def _of_axes(table: Table, turn_unit: str) -> tuple[FloatArray, tuple[str, ...]]:
     names = tuple(name for name in _COLUMNS if name in table.columns)
     if not names:
         raise ValueError(
@@ -103,7 +107,9 @@ def _of_axes(table: Table, unit: float) -> tuple[FloatArray, tuple[str, ...]]:
     readings = np.full((len(table.lines), 6), np.nan)
     for name in names:
         k = _COLUMNS.index(name)
-        readings[:, k] = table.numbers(name, may_be_missing=True) * (unit if k < 3 else 1.0)
+        units, usual = (TURN_UNITS, turn_unit) if k < 3 else (SPEEDS, "m/s")
+        scale = rate_unit(table, name, units, usual)
+        readings[:, k] = scale * table.numbers(name, may_be_missing=True)
     if "vx" in names and not {"vy", "vz"} & {*names}:
         readings[:, 4:] = 0.0
         if "wz" in names and not {"wx", "wy"} & {*names}:
@@ -113,7 +119,7 @@ def _of_axes(table: Table, unit: float) -> tuple[FloatArray, tuple[str, ...]]:
 
 def _of_wheels(table: Table, wheelbase_m: float | None) -> tuple[FloatArray, tuple[str, ...]]:
     table.require(*_WHEELS)
-    left, right = (table.numbers(name) for name in _WHEELS)
+    left, right = (rate_unit(table, name, SPEEDS, "m/s") * table.numbers(name) for name in _WHEELS)
     names, width = _WHEELS, wheelbase_m
     if width is None:
         if "width" not in table.columns:
@@ -122,7 +128,7 @@ def _of_wheels(table: Table, wheelbase_m: float | None) -> tuple[FloatArray, tup
                 "a column width"
             )
         names = (*_WHEELS, "width")
-        width = table.numbers("width")
+        width = METRES[table.unit("width", METRES) or "m"] * table.numbers("width")
         table.check(width > 0, "width", "must be positive")
     else:
         width = check_number("wheelbase_m", width, low=1e-6)

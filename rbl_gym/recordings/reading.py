@@ -63,6 +63,12 @@ def read_recording(
         the ranges are invalid, the units do not fit together, or no epoch has a link. With
         `format.strict`, also at the first range or row that would be dropped or sorted.
     """
+    if not isinstance(run, str | None):
+        raise TypeError(
+            f"run must be the name of a run or None, got {run!r:.80}; give the format by name: "
+            "read_recording(files, format=...)"
+        )
+    _check_format(format)
     with every_fault(files, format):
         table, runs = _runs_of(files, format)
         if run is None and len(runs) > 1:
@@ -86,12 +92,18 @@ def read_runs(files: Files, format: Format = _AS_DESCRIBED) -> dict[str, Recordi
     with the name ``""``. If the truth has this column too, each run has its own truth. A truth
     without time and with a single pose per run belongs to a body at rest.
     """
+    _check_format(format)
     with every_fault(files, format):
         table, runs = _runs_of(files, format)
         return {
             run: _read(files, table if rows.all() else table.select(rows), run or None, format)
             for run, rows in runs.items()
         }
+
+
+def _check_format(format: Format) -> None:
+    if not isinstance(format, Format):
+        raise TypeError(f"format must be recordings.Format(columns={{...}}), got {format!r:.80}")
 
 
 def _runs_of(files: Files, format: Format) -> tuple[Table, dict[str, np.ndarray]]:

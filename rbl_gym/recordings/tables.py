@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym.checks import BoolArray, FloatArray, did_you_mean
+from rbl_gym.recordings.column_units import METRES, UNIT, check_unit, name_and_unit
 from rbl_gym.recordings.columns import Columns
 from rbl_gym.recordings.stamps import TIME_UNITS, found_unit, iso_seconds, seconds_per
 from rbl_gym.recordings.text import is_number, read_cells
@@ -24,7 +25,6 @@ MAX_RANGE_M = 10e3
 MAX_COORDINATE_M = 1e8  # geocentric and map coordinates are in the world frame
 MAX_TIME_S = 1e11  # the year 5138
 TOO_LONG = f"must be at most {MAX_RANGE_M:.0f} m (looks like millimetres?)"
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # What loggers write for a missing number.
 _MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-", "inf", "-inf", "+inf"))
@@ -43,9 +43,6 @@ _QUANTITIES = {
     *_OTHER_NAMES, *itertools.chain(*_OTHER_NAMES.values()),
     "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz", "left", "right",
 }  # fmt: skip
-_UNIT = re.compile(
-    "\\s*[\\[(](|s|ms|[u\u00b5\u03bc]s|ns|m|cm|mm|deg|rad)[\\])]$|_(s|ms|us|ns|m|cm|mm)$"
-)
 
 
 class Source(NamedTuple):
@@ -64,7 +61,10 @@ class Source(NamedTuple):
     def given(self, **names: str) -> str:
         """Return the names of columns as `Format.columns` and the command line take them."""
         prefix = "" if self.file == "ranges" else f"{self.file}."
-        return ",".join(f"{prefix}{content}={name}" for content, name in names.items())
+        return ",".join(
+            f"{prefix}{'time' if content == 't' else content}={name}"
+            for content, name in names.items()
+        )
 
 
 AS_NAMED = Source()
@@ -214,9 +214,13 @@ class Table(NamedTuple):
     def points(self, columns: Iterable[str], most: float = MAX_COORDINATE_M) -> FloatArray:
         """Return (rows, len(columns)) coordinates in metres, of magnitude `most` at most."""
         points = {column: self.numbers(column) for column in columns}
-        too_far = f"must be at most {most:.0f} m (looks like millimetres?)"
         for column, values in points.items():
             values *= METRES[self.unit(column, METRES) or "m"]
+            too_far = f"must be at most {most:.0f} m (looks like millimetres?"
+            if self.source.file:
+                told = self.source.given(**{column: f"{self.name(column)}[mm]"})
+                too_far += f' then give --columns "{told}"'
+            too_far += ")"
             self.check(np.abs(values) <= most, column, too_far)
         return np.stack([*points.values()], axis=-1)
 
@@ -256,21 +260,24 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
     cannot be read, a row does not fit the header, a column named by `source` does not exist, or no
     row is left.
     """
-    asked = {_name_and_unit(name)[0] for name in source.columns.values()}
+    said = {role: name_and_unit(name, source.file) for role, name in source.columns.items()}
+    asked = {name for name, _ in said.values()}
     numbered = bool(asked) and all(name.isdigit() for name in asked)
     cells = read_cells(os.fspath(path), headless, numbered)
     where = f"{cells.path}, line {cells.header_line}"
     header, units = [], {}
     for i, cell in enumerate(cells.header, 1):
-        name, units_of = _name_and_unit(cell)
+        name, units_of = name_and_unit(cell, source.file)
         header.append(name or f"(column {i})")
         units[header[-1]] = units_of
     if not (first := is_first(header)).all():
         name = header[first.argmin()]
         raise ValueError(f"{where}: two columns have the name {name!r}: rename one")
     by_name = Columns({name: i for i, name in enumerate(header)}, cells.columns, cells.values)
-    said = {role: _name_and_unit(name) for role, name in source.columns.items()}
     names = _roles(where, header, {role: name for role, (name, _) in said.items()}, source)
+    for role, (name, unit) in said.items():
+        if source.file and unit and source.columns[role].strip() != name:  # in brackets
+            check_unit(where, source.file, role, name, unit)
     units |= {name: unit for name, unit in said.values() if unit}
     rows = np.ones(len(cells.lines), dtype=bool)
     for column, want in source.where.items():
@@ -290,24 +297,14 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
             {role: header.index(name) for role, name in names.items()}, cells.columns, cells.values
         ),
         names,
-        {role: units[name] for role, name in names.items() if units[name]},
+        {role: units[name] for role, name in names.items() if units[name]}
+        | {role: unit for role, (name, unit) in said.items() if "{" in name and unit},
         cells.decimal,
         cells.cut,
         tuple(names.get(column, column) for column in source.where),
         source,
     )
     return table if rows.all() else table.select(rows)
-
-
-def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Split a name and its unit: ``time [ms]`` is ``time`` in ms; ``time_ms`` keeps its name."""
-    cell = cell.strip()
-    unit = _UNIT.search(cell)
-    if unit is None:
-        return cell, ""
-    if unit[2]:
-        return cell, unit[2]
-    return cell[: unit.start()], re.sub("[\u00b5\u03bc]", "u", unit[1])
 
 
 def _roles(
@@ -354,7 +351,7 @@ def _roles(
         like = [
             name
             for name in header
-            if name not in taken and re.sub(r"[\s-]+", "_", _UNIT.sub("", name.lower())) in others
+            if name not in taken and re.sub(r"[\s-]+", "_", UNIT.sub("", name.lower())) in others
         ]
         if len(like) == 1:
             names[role] = like[0]

@@ -128,6 +128,8 @@ def read_truth(
     planar = len(places) == 2
     translation = np.pad(table.points(places), ((0, 0), (0, 3 - len(places))))
     said.read(table, ("t", "run", *places, *angles))
+    if rotation is None:
+        said.note(table.path, _heading_hint(table))
     form = _form(table, len(angles), planar)
     if "t" not in table.columns and times is not None and once:
         shape = len(times), 3
@@ -195,6 +197,22 @@ def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
         table.check(np.abs(turn) * unit <= np.radians(MAX_YAW_DEG), name, must)
         rotation = rotation @ rotations.exp(unit * turn[:, None] * np.eye(3)[axis])
     return rotation, tuple(columns.values())
+
+
+def _heading_hint(table: Table) -> str:
+    """Return words if a column that is not read may be the yaw; "" if there is none."""
+    for name in table.names.values():
+        words = re.findall("[a-z]+", name.lower())
+        unit = words.pop() if words[-1:] in (["deg"], ["rad"]) else ""
+        if words[-1:] not in (["heading"], ["theta"], ["azimuth"]):
+            continue
+        units = [unit] if unit else ["deg", "rad"]
+        told = (f"--columns truth.yaw_{each}={name}" for each in units)
+        return (
+            f"column {name!r} is not read; if it is the yaw, counted from x towards y, give "
+            f"{' or '.join(told)}"
+        )
+    return ""
 
 
 def _form(table: Table, angles: int, planar: bool) -> str:

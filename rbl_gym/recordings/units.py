@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
@@ -54,18 +56,26 @@ def check_units(
         hint = (
             "are the ranges in cm or mm? set --unit"
             if scale > 1
-            else f"are the positions in {paths[1]} in cm or mm, or is the unit of the ranges wrong?"
+            else f"are the positions in {paths[1]} in cm or mm{_remedy(paths, 'anchors')}, or is "
+            "the unit of the ranges wrong?"
         )
         raise ValueError(
             f"{paths[0]}: units look inconsistent, the median range is {typical:.4g} m and "
             f"the anchors lie {layout:.4g} m from their centre: {hint}"
         )
     newest, fresh = _held(times, ranges, links)
-    _check_spread(paths[2], tags, anchors, newest, fresh, typical)
+    _check_spread(paths, tags, anchors, newest, fresh, typical)
     if anchors_are != "move":
-        _check_pairs(paths[1], "anchors", anchors, ranges.swapaxes(1, 2), links.swapaxes(1, 2),
+        _check_pairs(paths, "anchors", anchors, ranges.swapaxes(1, 2), links.swapaxes(1, 2),
                  newest.swapaxes(1, 2), fresh.swapaxes(1, 2), typical)  # fmt: skip
-    _check_pairs(paths[2], "tags", tags, ranges, links, newest, fresh, typical)
+    _check_pairs(paths, "tags", tags, ranges, links, newest, fresh, typical)
+
+
+def _remedy(paths: Sequence[str], kind: str) -> str:
+    """Return how to state another unit of positions; they may be in the file of the ranges."""
+    before = "a" if paths[0] == paths[1] and kind == "anchors" else f"{kind}."
+    names = ",".join(f"{before}{axis}=NAME[mm]" for axis in "xyz")
+    return f' (then give --columns "{names}")'
 
 
 def _held(times: FloatArray, ranges: FloatArray, links: BoolArray) -> tuple[FloatArray, BoolArray]:
@@ -90,7 +100,7 @@ def _pairs(points: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
 
 
 def _check_pairs(
-    path: str,
+    paths: tuple[str, str, str],
     name: str,
     points: FloatArray,
     ranges: FloatArray,
@@ -100,6 +110,7 @@ def _check_pairs(
     typical: float,
 ) -> None:
     """Raise ValueError if points (P, 3), last axis of the ranges, break a triangle inequality."""
+    path = paths[1 if name == "anchors" else 2]
     one, other, distance = _pairs(points)
     both = fresh[..., one] & fresh[..., other]
     if both.sum() >= _FEWEST:
@@ -109,7 +120,7 @@ def _check_pairs(
             raise ValueError(
                 f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart, "
                 f"but the ranges to two of them have a sum of only {np.median(total):.4g} m: are "
-                f"the positions of the {name} in cm or mm?"
+                f"the positions of the {name} in cm or mm?{_remedy(paths, name)}"
             )
     some = slice(None, None, 1 + len(ranges) // _EPOCHS)
     ranges, links = ranges[some], links[some]
@@ -126,7 +137,7 @@ def _check_pairs(
 
 
 def _check_spread(
-    path: str,
+    paths: tuple[str, str, str],
     tags: FloatArray,
     anchors: FloatArray,
     newest: FloatArray,
@@ -148,11 +159,12 @@ def _check_spread(
     share = (np.abs(newest[..., one] - newest[..., other]) / distance)[both]
     seen = float(np.quantile(share, 0.9))
     if seen < _BROADSIDE:
+        unit = "mm" if seen < _MILLI else "cm"
         raise ValueError(
-            f"{path}: units look inconsistent, tags are up to {distance.max():.4g} m apart, "
+            f"{paths[2]}: units look inconsistent, tags are up to {distance.max():.4g} m apart, "
             "but the ranges of an anchor to two tags differ by at most "
             f"{100 * seen:.2g} % of this: are the positions of the tags in "
-            f"{'mm' if seen < _MILLI else 'cm'}?"
+            f"{unit}?{_remedy(paths, 'tags').replace('mm', unit)}"
         )
 
 

@@ -110,7 +110,7 @@ def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
     if truth is not None and len(truth.times) > 1 and len(times) > 1:
         ratio = float(np.ptp(times) / np.ptp(truth.times))
         for name, value in (("ranges", ratio), ("truth", 1 / max(ratio, 1e-30))):
-            option = "--time-unit {}" if name == "ranges" else "--columns truth.t=NAME[{}]"
+            option = "--time-unit {}" if name == "ranges" else "--columns truth.time=NAME[{}]"
             for scale, prefix, unit in _SI:
                 # Logs of the same run are about equally long.
                 if 0.2 < value * scale < 5:
