@@ -362,3 +362,15 @@ def test_a_picture_has_the_title_and_the_room_of_the_scene():
     assert body._stage(scenes.get(moving)).high == (6, 5, 3)
     racks = scenes.get({**ROOM, "obstacles": [[3, 2, 1, 0.5, 0.5, 1]]})
     assert body._stage(racks).low == (0, 0, 0)
+
+
+def test_common_errors_of_toml_say_what_to_do(tmp_path):
+    path = tmp_path / "room.toml"
+    for text, words in (
+        ("[walls]\nhigh_m = 3\n[walls]\n", r"twice.*: write \[\[walls\]\] for each"),
+        ("[walls]\nhigh_m = 10 cm  # low\n", "line 2.*: values are numbers without units"),
+        ("[walls]\nhigh_m = = 10\n", "line 2, column 10\\)$"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=words):
+            scene_files.load(str(path))

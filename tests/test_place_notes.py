@@ -5,12 +5,13 @@ import pytest
 
 pytest.importorskip("shapely", reason="needs the extra placement")
 
-from rbl_gym.app import place_answer, place_figures, place_report, place_svg
+from rbl_gym.app import place_answer, place_figures, place_pdf, place_report, place_svg
 from rbl_gym.app import place_shapes as shapes
 from rbl_gym.app.place_notes import deciding_notes, nees_notes, through_walls_notes, usual_notes
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import accuracy, check
 from rbl_gym.studies.placing.answer import Question, place_anchors
+from rbl_gym.studies.placing.given import given_notes
 from rbl_gym.studies.placing.judging import judge, short_row
 
 HALL = {
@@ -154,3 +155,43 @@ def test_maps_and_table_of_the_worst_loss_at_each_place():
     assert zone["any_loss"]["share"] <= zone["share"]
     titles = [rows.title for rows in place_report.tables(placed.result)]
     assert titles[1] == "after the loss of the anchor that hurts most at each place"
+
+
+def test_given_anchors_in_a_wall_or_just_off_a_mount_are_named():
+    walls = {
+        "mounts": [
+            *HALL["mounts"],
+            {"kind": "wall", "name": "west", "line": [[0, 8], [0, 0]], "low_m": 1, "high_m": 2.5},
+        ],
+        "walls": [{"line": [[0, 8], [0, 0]], "thickness_m": 0.2, "high_m": 3}],
+        "obstacles": [{"low": [9, 0, 0], "high": [10, 0.5, 2]}],
+    }
+    problem = scene_files.of_mapping(HALL | walls)
+    anchors = [[0.1, 2, 2], [0.15, 4, 2], [0.05, 5, 2], [9.5, 0.2, 1], [6, 4, 3], [6, 4, 1]]
+    names = ["on", "off", "in", "box", "up", "free"]
+    box, wall, off = given_notes(problem, np.array(anchors, float), names)
+    assert wall.startswith("Anchor 'in' is inside a wall or an obstacle: x -0.10 to 0.10 m, y 0.00")
+    assert box.startswith("Anchor 'box' is inside a wall or an obstacle: x 9.00 to 10.00 m")
+    assert "'off' 0.05 m from 'west', where it would be at (0.100, 4.000, 2.000)." in off
+    assert off.count("where") == 1
+    placed = place_anchors(
+        problem, Question(range(4, 5), layout=np.array(anchors[:4]), trials=4, survive=0)
+    )
+    assert sum("inside a wall" in note for note in place_answer.warnings(placed.result)) == 2
+    assert place_answer.question(placed.result)[0] == "How good are these 4 anchors in 'file'?"
+
+
+def test_the_first_page_has_all_zones_above_the_footnote(tmp_path):
+    zones = [HALL["zones"][0] | {"name": name} for name in ("A", "B", "C", "D")]
+    problem = scene_files.of_mapping(HALL | {"zones": zones})
+    placed = place_anchors(
+        problem, Question(range(4, 5), layout=ANCHORS, trials=4, survive=1, names=("P", "Q"))
+    )
+    page = place_pdf._title_page(placed.result)
+    heights = {text.get_text(): text.get_position()[1] for text in page.texts}
+    assert {"A", "B", "C", "D"} <= set(heights)
+    assert heights["D"] - 0.04 > max(y for text, y in heights.items() if "Cramer" in text) + 0.02
+    assert place_answer.question(placed.result)[0].endswith("in 'file', also if any one fails?")
+    table = place_report.tables(placed.result)
+    shown = next(one for one in table if "worst without" in one.headings)
+    assert {row[-1] for row in shown.rows} <= {"1", "2", "3", "4"} | {"P", "Q"}

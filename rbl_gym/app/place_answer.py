@@ -147,9 +147,15 @@ def typical(zones: list[dict[str, Any]]) -> str:
 def question(result: dict[str, Any]) -> list[str]:
     """Return the question, one line per part."""
     count = result["n_anchors"]
-    lines = [
-        f"Where should {count} anchors go in {result['scene']!r}, and how accurate is the pose?"
-    ]
+    scene = repr(result["scene"])
+    if result["method"] == "given":
+        fails = ", also if any one fails" if result["survive"] else ""
+        lines = [f"How good are these {count} anchors in {scene}{fails}?"]
+    else:
+        fails = " if any one may fail" if result["survive"] else ""
+        lines = [
+            f"Where should {count} anchors go in {scene}{fails}, and how accurate is the pose?"
+        ]
     for zone in zone_answers(result):
         if zone.asks:
             lines.append(f"{zone.name}: {zone.asks}")
@@ -180,6 +186,12 @@ def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
         )
         found.append(ZoneAnswer(zone["name"], zone["verdict"], asks, reached, figures))
     return found
+
+
+def without_name(result: dict[str, Any], row: dict[str, Any]) -> str | None:
+    """Return the name of the anchor whose loss hurts a zone most; None if none may fail."""
+    number = row.get("without_anchor")
+    return None if number is None else str(result["anchors"][number - 1]["name"])
 
 
 def percent(share: float) -> str:

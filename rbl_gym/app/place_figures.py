@@ -131,7 +131,7 @@ def legend_text(problem: Problem) -> str:
     parts = ["triangles: anchors, by number"]
     if len(problem.fixed):
         parts.append("squares: fixed anchors")
-    parts += ["dashed: zones", "violet: where anchors may stand"]
+    parts += ["dashed: zones", "violet: where anchors may be mounted"]
     if problem.obstacles:
         parts.append("grey: obstacles, darker if they weaken links more")
     return "     ".join(parts)

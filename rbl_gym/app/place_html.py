@@ -82,7 +82,7 @@ def place_scene(placed: Placed) -> go.Figure:
     if not isinstance(problem.mounts, Mounts | Shell):
         edges = box_edges(*problem.mounts.bounds())
         style = {"color": "#8a8f94", "width": 3}
-        shown.add_trace(solids.lines(edges, name="where anchors may stand", line=style))
+        shown.add_trace(solids.lines(edges, name="where anchors may be mounted", line=style))
     blocks = shapes.solids(problem)
     if blocks:
         shown.add_trace(

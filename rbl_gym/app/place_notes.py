@@ -23,7 +23,7 @@ def deciding_notes(result: dict[str, Any]) -> list[str]:
     found = [(zone, "") for zone in result["zones"]]
     less = (result.get("fewest") or {}).get("one_less")
     if less is not None:
-        found += [(zone, f"With {less['n_anchors']} anchors, ") for zone in less["zones"]]
+        found += [(zone, f"with {less['n_anchors']} anchors, ") for zone in less["zones"]]
     texts, longest = [], 0.0
     for zone, where in found:
         if zone["verdict"] != "fail" or "decides" not in zone:

@@ -21,6 +21,8 @@ from rbl_gym.studies.placing.layout_export import mounting_list
 _PAGE = (11.69, 8.27)
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.06, 0.94, 0.9, 0.08
 _ROW = 0.027
+# The zones of the first page end above its footnote.
+_ZONES_END = 0.1
 _COLOURS = {
     "pass": shapes.WITHIN,
     "fail": shapes.BEYOND,
@@ -96,17 +98,17 @@ def _page(title: str) -> Figure:
 
 def _title_page(result: dict[str, Any]) -> Figure:
     page = Figure(figsize=_PAGE)
-    page.text(_LEFT, 0.88, f"Anchors for {result['scene']}", fontsize=24, fontweight="bold")
-    y = 0.80
+    page.text(_LEFT, 0.90, f"Anchors for {result['scene']}", fontsize=24, fontweight="bold")
+    y = 0.85
     page.text(_LEFT, y, "Question", fontsize=12, fontweight="bold", color="0.35")
     for line in place_answer.question(result)[:12]:
         for part in textwrap.wrap(line, 105):
-            y -= 0.032
+            y -= 0.030
             page.text(_LEFT, y, part, fontsize=11)
-    y -= 0.07
+    y -= 0.06
     page.text(_LEFT, y, "Answer", fontsize=12, fontweight="bold", color="0.35")
     overall = result["verdict"]
-    y -= 0.055
+    y -= 0.05
     _badge(page, _LEFT, y, overall)
     page.text(
         _LEFT + (0.15 if overall != "no requirement" else 0.0),
@@ -116,20 +118,24 @@ def _title_page(result: dict[str, Any]) -> Figure:
         va="center",
     )
     for line in place_answer.warnings(result):
-        for part in textwrap.wrap(line, 130):
-            y -= 0.028
-            page.text(_LEFT, y - 0.01, part, fontsize=9, va="center")
+        for part in textwrap.wrap(line, 155):
+            y -= 0.024
+            page.text(_LEFT, y - 0.014, part, fontsize=9, va="center")
     y -= 0.06
-    for zone in place_answer.zone_answers(result):
-        if y < 0.12:
-            page.text(_LEFT, y, "more zones: see the tables", fontsize=10, color="0.35")
+    zones = place_answer.zone_answers(result)
+    step = min(0.09, max(0.055, (y - _ZONES_END) / len(zones)))
+    for number, zone in enumerate(zones):
+        last = number == len(zones) - 1
+        if y - 0.64 * step < _ZONES_END + (0.0 if last else 0.025):
+            more = "more zones: see the tables" if number else "zones: see the tables"
+            page.text(_LEFT, y, more, fontsize=10, color="0.35", va="center")
             break
         _badge(page, _LEFT, y - 0.012, zone.verdict)
         page.text(0.21, y, zone.name, fontsize=11, fontweight="bold", va="center")
         said = "; ".join(part for part in (zone.reached, zone.figures) if part)
         for k, line in enumerate(textwrap.wrap(said, 118)[:2]):
-            page.text(0.21, y - 0.028 * (k + 1), line, fontsize=9, va="center")
-        y -= 0.09
+            page.text(0.21, y - 0.31 * step * (k + 1), line, fontsize=9, va="center")
+        y -= step
     page.text(
         _LEFT,
         0.06,
@@ -163,7 +169,7 @@ def _badge(page: Figure, x: float, y: float, verdict: str) -> None:
 @place_figures.styled
 def _plan_page(placed: Placed) -> Figure:
     problem, anchors = placed.problem, placed.design.anchors
-    page = _page("Plan: anchors, zones, and where anchors may stand")
+    page = _page("Plan: anchors, zones, and where anchors may be mounted")
     axes = page.add_axes((0.07, 0.13, 0.86, 0.76))
     for zone in problem.zones:
         axes.fill(*zone.polygon.T, color="#dcecf7", zorder=0)
@@ -181,7 +187,8 @@ def _map_page(placed: Placed, maps: Any, quantity: shapes.Quantity) -> Figure:
     problem = placed.problem
     title = "Requirements" if quantity.field == "relative" else f"Error of {quantity.name}"
     page = _page(title)
-    axes = page.add_axes((0.07, 0.13, 0.80, 0.73))
+    # A title of two lines needs room above.
+    axes = page.add_axes((0.07, 0.12, 0.80, 0.70))
     texts = place_figures.map_panel(axes, placed, maps, quantity, heights=False)
     place_draw.settle_labels(page, [(axes, texts)])
     page.text(0.5, 0.055, place_figures.legend_text(problem), ha="center", fontsize=8, color="0.35")

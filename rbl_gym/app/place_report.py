@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
-from rbl_gym.app.place_answer import WORDS, typical
+from rbl_gym.app.place_answer import WORDS, typical, without_name
 from rbl_gym.app.place_loss import loss_tables
 from rbl_gym.app.place_survey import survey_table
 
@@ -128,7 +128,7 @@ def _zones(result: dict[str, Any]) -> Rows:
             for what in ("median", "p95")
         ]
         rows.append(
-            [row["name"], WORDS[row["verdict"]], *_share(row), *figures, row.get("without_anchor")]
+            [row["name"], WORDS[row["verdict"]], *_share(row), *figures, without_name(result, row)]
         )
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from rbl_gym.app.page import digits
-from rbl_gym.app.place_answer import HOW_TO_ASK, WORDS, percent, warnings
+from rbl_gym.app.place_answer import HOW_TO_ASK, WORDS, percent, warnings, without_name
 from rbl_gym.app.place_loss import loss_tables
 from rbl_gym.app.place_report import (
     Rows,
@@ -96,7 +96,7 @@ def _zones(result: dict[str, Any]) -> Rows:
             cells += ["-"] * 3
         cells += [digits(row[key]["p95"], 3) for key, _ in keys]
         if result["survive"]:
-            cells.append(str(row["without_anchor"]))
+            cells.append(without_name(result, row) or "-")
         if asks:
             cells.append(required(row["required"]) if "share" in row else "-")
         rows.append(cells)

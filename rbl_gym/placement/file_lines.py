@@ -7,6 +7,12 @@ import re
 # Start of an error message: a table, perhaps with an index, perhaps with a key.
 _SUBJECT = re.compile(r"^([A-Za-z_]\w*)(?:\[(\d+)\])?(?:(?:\.|: )([A-Za-z_]\w*))?")
 
+# Errors of the TOML parser.
+_TWICE = re.compile(r"Cannot declare \('(\w+)',\) twice")
+_AT = re.compile(r"at line (\d+)")
+# A number that is followed by a unit.
+_UNIT = re.compile(r"^\s*\w+\s*=\s*[-+]?[\d.]+\s*[A-Za-z%\u00b0]+\s*(#.*)?$")
+
 _UNKNOWN = re.compile(r"unknown key '(\w+)'")
 
 
@@ -35,3 +41,22 @@ def line_of(text: str, message: str) -> int | None:
         if key is not None and re.match(rf"{key}\s*=", lines[k]):
             return k + 1
     return start + 1
+
+
+def advice(data: bytes, message: str) -> str:
+    """Return what to do about an error of the TOML parser, after its message; ``""`` if unknown.
+
+    Parameters
+    ----------
+    data
+        The file.
+    message
+        The error.
+    """
+    if twice := _TWICE.search(message):
+        return f": write [[{twice[1]}]] for each"
+    lines = data.decode("utf-8", errors="replace").split("\n")
+    at = _AT.search(message)
+    if at and int(at[1]) <= len(lines) and _UNIT.match(lines[int(at[1]) - 1]):
+        return ": values are numbers without units; the unit is in the name of the key"
+    return ""

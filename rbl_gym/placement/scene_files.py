@@ -27,7 +27,7 @@ from rbl_gym.measurements.ranging import NOISE_LAWS, NoiseLaw
 from rbl_gym.placement.building import Plan, Problem, Zone
 from rbl_gym.placement.file_checks import check_numbers, check_problem
 from rbl_gym.placement.file_keys import BODIES, FORMAT, MAX_ANCHORS, MIN_ANCHORS
-from rbl_gym.placement.file_lines import line_of
+from rbl_gym.placement.file_lines import advice, line_of
 from rbl_gym.placement.file_tables import as_table, check_text, read_table
 from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, show
 from rbl_gym.placement.mounting import cut_mounts
@@ -110,7 +110,7 @@ def load(path: str) -> dict[str, Any]:
         found = tomllib.loads(text) if path.lower().endswith(".toml") else json.loads(text)
     # Both parsers recurse into nested values.
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {error}{advice(data, str(error))}") from error
     return as_table(found, path)
 
 
@@ -224,7 +224,7 @@ def _rows(tables: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
     """Return the values of all tables of a list."""
     rows = tables.get(name, [])
     if not isinstance(rows, list):
-        raise ValueError(f"{name} must be a list of tables, got {rows!r:.80}")
+        raise ValueError(f"{name} must be a list of tables, [[{name}]], got {rows!r:.80}")
     return [read_table(f"{name}[{index}]", row, name) for index, row in enumerate(rows)]
 
 

@@ -302,7 +302,7 @@ class _Maker:
             low = min(_MOUNT_LOW_M, 0.7 * self.height)
             self.found["mounts"] = [
                 {
-                    "#": "no layer of mounts: anchors may stand on both sides of every wall",
+                    "#": "no layer of mounts: anchors may be mounted on both sides of every wall",
                     "kind": "wall",
                     **{key: wall[key] for key in ("line", "closed") if key in wall},
                     "low_m": rounded(max(low, wall["low_m"])),
@@ -313,12 +313,14 @@ class _Maker:
                 if wall["high_m"] > low
             ]
             if self.found["mounts"]:
-                self.said.append("no layer of mounts: anchors may stand on every wall")
+                self.said.append("no layer of mounts: anchors may be mounted on every wall")
             else:
-                self.said.append("no layer of mounts or walls: anchors may stand on the ceiling")
+                self.said.append(
+                    "no layer of mounts or walls: anchors may be mounted on the ceiling"
+                )
                 self.found["mounts"] = [
                     {
-                        "#": "no layer of mounts: anchors may stand on the ceiling",
+                        "#": "no layer of mounts: anchors may be mounted on the ceiling",
                         "kind": "ceiling",
                         "polygon": self._outline(),
                         "height_m": rounded(self.height),

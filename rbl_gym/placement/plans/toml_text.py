@@ -13,15 +13,16 @@ _WIDTH = 96
 _REMARKS = {
     "anchors": "number of anchors to place, `fixed` ones included",
     "zones": "where the body works; requirements: position_m = 0.10, heading_deg = 5.0, "
-    "share = 0.95 of the zone",
-    "mounts": "where anchors may stand: wall, ceiling, column, area or points",
+    "share = 0.95 of the zone; attitude: free, level or heading (turned about the vertical only)",
+    "mounts": "where anchors may be mounted: wall, ceiling, column, area or points",
     "forbidden": "no anchors here",
     "walls": "each crossing leaves the share of a link's information that [materials] gives",
     "obstacles": "what weakens links, and where the body cannot be",
     "materials": "share of a link's information that one crossing leaves, 10^(-loss / 10 dB): "
-    "rough values, enter your own",
+    "rough values, enter your own; drywall, glass, wood, brick, concrete and metal are known "
+    "without an entry",
     "plan": "the drawing from which this was read; layouts are exported to its coordinates",
-    "body": "the tags on the body: a shape, or tags = [[x, y, z], ...] in metres",
+    "body": "the tags on the body: a shape and size_m, or only tags = [[x, y, z], ...] in metres",
     "noise": "standard deviation of a range: enter that of your radio",
 }
 

@@ -19,6 +19,7 @@ from rbl_gym.studies.placing.changes import is_flat, out_of_plane, with_next
 from rbl_gym.studies.placing.choosing import Fewest
 from rbl_gym.studies.placing.contributions import without_each
 from rbl_gym.studies.placing.design import Design
+from rbl_gym.studies.placing.given import given_notes
 from rbl_gym.studies.placing.judging import (
     PLACES,
     Judged,
@@ -208,13 +209,14 @@ def _result(
     edges = [at_edges(problem, anchors, one) for one in judged]
     rows = _anchors(problem, question, anchors, judged)
     names = [row["name"] for row in rows]
+    given = found.method == "given"
     result: dict[str, Any] = {
         "scene": problem.name,
         "seed": seed,
         "n_anchors": len(anchors),
         "verdict": verdict(judged),
         "survive": survive,
-        "notes": list(problem.notes),
+        "notes": [*problem.notes, *(given_notes(problem, anchors, names) if given else [])],
         "zones": [zone_row(*pair) for pair in zip(judged, edges, strict=True)],
         "region": {"low_m": low.tolist(), "high_m": high.tolist()},
         "obstacles": _obstacles(problem),
