@@ -89,6 +89,17 @@ def test_plain_progress_is_silent_away_from_a_terminal(without_rich, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("rich", [False, True])
+def test_long_work_writes_lines_away_from_a_terminal(rich, monkeypatch, capsys):
+    known = terminal.has_rich
+    monkeypatch.setattr(terminal, "has_rich", lambda: rich and known())
+    monkeypatch.setattr(terminal, "_LINE_S", 0.0)
+    with terminal.progress("placing", 2) as advance:
+        advance(more=1)
+        advance()
+    assert capsys.readouterr().err.startswith("placing 1/3\nplacing 2/3\n")
+
+
 def test_plain_progress_counts_on_a_terminal(without_rich, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with terminal.progress("replay") as advance:

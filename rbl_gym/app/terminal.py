@@ -25,6 +25,8 @@ FILTER_HELP = (
 _PICTURES = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".eps")
 # Time between two updates of a progress bar.
 _REFRESH_S = 0.05
+# Away from a terminal long work writes a line this often, seconds.
+_LINE_S = 20.0
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -88,10 +90,13 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=rich_console(stderr=True)) as bar:
         task, done, shown = bar.add_task(label, total=total), 0, 0.0
+        told = time.monotonic()
 
         def advance(steps: int = 1, *, more: int = 0) -> None:
-            nonlocal done, total, shown
+            nonlocal done, total, shown, told
             done, total = done + steps, total + more
+            if not bar.console.is_interactive:
+                told = _line(label, done, total, told)
             # An update takes as long as an epoch of a filter.
             if (now := time.monotonic()) > shown + _REFRESH_S:
                 shown = now
@@ -108,15 +113,26 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
         bar.update(task, completed=done, total=total)
 
 
+def _line(label: str, done: int, total: int, told: float) -> float:
+    """Write the progress if the last line was long ago; return the time of the last line."""
+    now = time.monotonic()
+    if now < told + _LINE_S:
+        return told
+    print(f"{label} {done}/{total}", file=sys.stderr, flush=True)
+    return now
+
+
 def _plain_progress(label: str, total: int) -> Iterator[Advance]:
-    """Show a line that is overwritten, on a terminal only."""
-    done, shown = 0, ""
+    """Show a line that is overwritten; away from a terminal a line at times."""
+    done, shown, told = 0, "", time.monotonic()
 
     def advance(steps: int = 1, *, more: int = 0) -> None:
-        nonlocal done, shown, total
+        nonlocal done, shown, total, told
         done, total = done + steps, total + more
         percent = f"{100 * done // max(total, 1)} %"
-        if sys.stderr.isatty() and percent != shown:
+        if not sys.stderr.isatty():
+            told = _line(label, done, total, told)
+        elif percent != shown:
             shown = percent
             print(f"\r{label} {done}/{total}", end="", file=sys.stderr, flush=True)
 
