@@ -248,7 +248,7 @@ def test_the_figures_have_these_names(placed):
     ]
     ratios = [f"{name}_ratio{of}" for name in ("position", "rotation") for of in ("", "_found")]
     assert set(result["check"]["filters"]["iterated EKF"]) == {
-        "found", "without_pose", "nees", "nees_found", "holds", "zones", *both, *ratios,
+        "found", "without_pose", "wrong", "nees", "nees_found", "holds", "zones", *both, *ratios,
     }  # fmt: skip
     assert result["obstacles"] == [{"low_m": [3, 2, 0], "high_m": [4, 3, 2.5]}]
 

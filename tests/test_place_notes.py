@@ -7,12 +7,20 @@ pytest.importorskip("shapely", reason="needs the extra placement")
 
 from rbl_gym.app import place_answer, place_figures, place_pdf, place_report, place_svg
 from rbl_gym.app import place_shapes as shapes
-from rbl_gym.app.place_notes import deciding_notes, nees_notes, through_walls_notes, usual_notes
+from rbl_gym.app.place_notes import (
+    cause_of,
+    deciding_notes,
+    lever_notes,
+    nees_notes,
+    through_walls_notes,
+    usual_notes,
+)
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import accuracy, check
 from rbl_gym.studies.placing.answer import Question, place_anchors
 from rbl_gym.studies.placing.given import given_notes
-from rbl_gym.studies.placing.judging import judge, short_row
+from rbl_gym.studies.placing.judging import at_edges, judge, judge_beside, short_row, zone_row
+from rbl_gym.studies.placing.lever import lever_row
 
 HALL = {
     "mounts": [{"kind": "ceiling", "polygon": [[0, 0], [12, 0], [12, 8], [0, 8]], "height_m": 3}],
@@ -71,6 +79,79 @@ def test_a_position_that_decides_with_one_anchor_less():
         "With 5 anchors, the horizontal position decides in zone 'a': at 95 % of the positions it "
         "is not determined."
     ]
+
+
+def trolley(attitude, shift=0.0):
+    tags = [[0.5, 0, 1.1 - shift], [-0.5, 0.3, 1.1 - shift], [-0.5, -0.3, 1.1 - shift]]
+    zone = HALL["zones"][0] | {"attitude": attitude, "low_m": shift, "high_m": shift + 0.02}
+    return scene_files.of_mapping(HALL | {"zones": [zone], "body": {"tags": tags}})
+
+
+def test_the_lever_of_the_tags_is_named():
+    """The errors it promises are those of the files that are changed as it says."""
+    problem, lower = trolley("level"), np.array([1, 1, 0.7])
+    anchors = np.vstack([ANCHORS, ANCHORS[:2] * lower])
+    (judged,) = judge(problem, anchors, 0)
+    lever = lever_row(problem, anchors, judged)
+    assert lever is not None
+    centre = problem.tags.mean(axis=0)
+    assert lever["distance_m"] == pytest.approx(np.linalg.norm(centre))
+    assert lever["position_m"] > 3 * lever["at_tags_m"]
+    (known,) = judge(trolley("heading"), anchors, 0)
+    assert lever["known_tilt_m"] == np.quantile(known.judged.horizontal[:600], 0.95)
+    # The tags are nearly above the origin: the zones differ by the height, and by 0.17 m sideways.
+    (moved,) = judge(trolley("level", 1.1), anchors, 0)
+    assert lever["at_tags_m"] == pytest.approx(np.quantile(moved.errors.horizontal, 0.95), rel=0.1)
+    row = zone_row(judged, at_edges(problem, anchors, judged)) | {"lever": lever}
+    (note,) = lever_notes({"zones": [row]})
+    assert note.startswith("Most of the horizontal error in zone 'hall' is the tilt times the")
+    assert "(1.11 m)" in note
+    assert 'attitude = "heading"' in note
+    # The origin at the tags, or a known tilt: nothing to say.
+    for other in (trolley("level", 1.1), trolley("heading")):
+        (judged,) = judge_beside(other, anchors, judge(other, anchors, 0))
+        assert lever_notes({"zones": [row | {"lever": lever_row(other, anchors, judged)}]}) == []
+
+
+def test_the_check_iterates_until_it_converges():
+    """Four iterations from 0.5 m and 10 deg lost 4 of these 1000 bodies, far from any minimum."""
+    precise = scene_files.of_mapping(
+        HALL
+        | {"zones": [HALL["zones"][0] | {"low_m": 0, "high_m": 0.02}]}
+        | {"body": {"tags": trolley("heading").tags.tolist()}, "noise": {"floor_m": 0.01}}
+    )
+    heights = [[0, 0, 0], [0, 0, -1.2], [0, 0, 0], [0, 0, -1.2]]
+    anchors = np.vstack([ANCHORS + heights, [6, 4, 3]])
+    figures = check.check_layout(precise, anchors, 1000, 0)["filters"]["iterated EKF"]
+    assert figures["found"] == 1
+    assert figures["wrong"] is None
+    assert figures["holds"]
+    assert cause_of("a", figures) == ""
+
+
+def test_the_cause_of_wrong_poses_is_named():
+    """A mirror image above anchors of one height agrees with the ranges."""
+    problem = trolley("heading", -1.3)
+    above = scene_files.of_mapping(
+        HALL
+        | {"zones": [HALL["zones"][0] | {"low_m": 1.3, "high_m": 1.32, "name": "low hall"}]}
+        | {"body": {"tags": problem.tags.tolist()}, "noise": {"floor_m": 0.03}}
+    )
+    figures = check.check_layout(above, ANCHORS, 600, 0)["filters"]["iterated EKF"]
+    wrong = figures["wrong"]
+    assert wrong["bodies"] == round(600 * (1 - figures["found"])) == wrong["fit"]
+    assert wrong["zones"] == ["low hall"]
+    assert wrong["height_m"] > 10 * wrong["horizontal_m"]
+    text = cause_of("a", figures)
+    assert text.startswith(f" Wrong poses of 'a': {wrong['bodies']}, in 'low hall'.")
+    assert "The error is mainly in the height" in text
+    assert "false minima" not in text
+    far = figures | {"wrong": wrong | {"fit": 0, "bodies": 1}, "position_ratio_found": 1.02}
+    assert cause_of("a", far) == (
+        " Wrong poses of 'a': 1, in 'low hall'. 1 does not agree with the ranges: false minima, "
+        "from a start that is too far away. Without them the position RMSE is 1.02 times the "
+        "predicted one."
+    )
 
 
 def test_bodies_that_reach_through_a_wall_are_counted():

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 from rbl_gym.app.place_notes import (
     NAMES,
+    cause_of,
     deciding_notes,
+    lever_notes,
     nees_notes,
     through_walls_notes,
     usual_notes,
@@ -66,7 +68,7 @@ def warnings(result: dict[str, Any]) -> list[str]:
     Notes on the file, the requirement that decides, usual layouts that are better in a part, a
     mirror image, zones that are too close to tell, a check that contradicts the prediction.
     """
-    found = [*result["notes"], *deciding_notes(result), *usual_notes(result)]
+    found = [*result["notes"], *deciding_notes(result), *lever_notes(result), *usual_notes(result)]
     if result["coplanar"]:
         found.append(
             "All anchors lie in one plane. A body on the other side of the plane (for anchors on a "
@@ -110,12 +112,13 @@ def _contradictions(result: dict[str, Any]) -> list[str]:
     The filter that is not told about blocked links does not count: the prediction assumes that they
     are known.
     """
-    parts, any_lost = [], False
+    parts, any_lost, causes = [], False, ""
     for name, figures in result["check"]["filters"].items():
         lost = 100 * (1 - figures["found"])
         if figures["holds"] or name.endswith("not told"):
             continue
         any_lost |= lost > 0
+        causes += cause_of(name, figures)
         if lost > 0:
             parts.append(f"{name!r} has no pose or a wrong one for {digits(lost)} % of the bodies")
         else:
@@ -127,7 +130,7 @@ def _contradictions(result: dict[str, Any]) -> list[str]:
     return [
         "The check by Monte Carlo does not confirm the prediction, on which the verdict is based: "
         f"{', '.join(parts)}; see the table 'checked by Monte Carlo'."
-        f"{cause if any_lost and result['coplanar'] else ''}"
+        f"{causes}{cause if any_lost and result['coplanar'] else ''}"
     ]
 
 

@@ -14,6 +14,8 @@ NAMES = {
 }
 # A usual layout is mentioned if its b is smaller by this factor.
 _MUCH_SMALLER = 2.0
+# The lever of the tags is mentioned if the horizontal error without it is smaller by this factor.
+_LEVER = 1.5
 # The NEES of a consistent filter is 6, the number of unknowns; a note above this multiple of it.
 _UNKNOWNS, _HIGH_NEES = 6, 1.5
 
@@ -62,6 +64,33 @@ def _spacing(result: dict[str, Any], factor: float) -> str:
         f"instead of {span:.2f} m. More anchors help less: twice the distance is worth about "
         "four times as many anchors."
     )
+
+
+def lever_notes(result: dict[str, Any]) -> list[str]:
+    """Return a note if most of the horizontal error is the tilt times the distance of the tags."""
+    found: list[tuple[float, dict[str, Any]]] = []
+    for zone in result["zones"]:
+        lever = zone.get("lever")
+        if lever is None:
+            continue
+        least = max(lever["at_tags_m"], lever["known_tilt_m"])
+        if lever["position_m"] < _LEVER * least:
+            continue
+        found.append((lever["position_m"] / least, zone))
+    if not found:
+        return []
+    _, zone = max(found, key=lambda row: row[0])
+    lever, others = zone["lever"], [repr(row["name"]) for _, row in found if row is not zone]
+    also = f" The same holds in {', '.join(others)}." if others else ""
+    return [
+        f"Most of the horizontal error in zone {zone['name']!r} is the tilt times the distance of "
+        f"the body's origin from the tags ({lever['distance_m']:.2f} m). At 95 % of the positions "
+        f"the error is {digits(zone['position_m']['p95'], 3)} m; with a known tilt it would be "
+        f"{digits(lever['known_tilt_m'], 3)} m, with the origin at the tags "
+        f"{digits(lever['at_tags_m'], 3)} m.{also} For a cart that stays upright, use "
+        'attitude = "heading" in [[zones]], or put the origin of [body] at the tags. More anchors '
+        "help less."
+    ]
 
 
 def usual_notes(result: dict[str, Any]) -> list[str]:
@@ -118,6 +147,37 @@ def through_walls_notes(result: dict[str, Any]) -> list[str]:
         "Their figures count, but the robot cannot be there. If this matters, keep the zone away "
         f"from walls and obstacles: the farthest tag is {reach:.2f} m from the origin."
     ]
+
+
+def cause_of(name: str, figures: dict[str, Any]) -> str:
+    """Return why the wrong poses of a filter are wrong, as a sentence; ``""`` if there are none."""
+    wrong = figures.get("wrong")
+    if wrong is None:
+        return ""
+    bodies, fit = wrong["bodies"], wrong["fit"]
+    zones = ", ".join(map(repr, wrong["zones"]))
+    parts = [f" Wrong poses of {name!r}: {bodies}, in {zones}."]
+    if fit:
+        parts.append(
+            f"{fit} agree{'s' * (fit == 1)} with the ranges as well as the true pose does."
+        )
+        if wrong["height_m"] > 2 * wrong["horizontal_m"]:
+            parts.append(
+                f"The error is mainly in the height ({digits(wrong['height_m'], 3)} m): mirror "
+                "images above anchors of nearly one height. Anchors at different heights, or a "
+                "filter that is told the height, prevent them."
+            )
+    if bodies > fit:
+        parts.append(
+            f"{bodies - fit} do{'es' * (bodies - fit == 1)} not agree with the ranges: false "
+            "minima, from a start that is too far away."
+        )
+    ratio = figures.get("position_ratio_found")
+    if ratio is not None:
+        parts.append(
+            f"Without them the position RMSE is {digits(ratio, 3)} times the predicted one."
+        )
+    return " ".join(parts)
 
 
 def nees_notes(result: dict[str, Any]) -> list[str]:

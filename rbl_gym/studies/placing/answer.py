@@ -32,6 +32,7 @@ from rbl_gym.studies.placing.judging import (
     verdict,
     zone_row,
 )
+from rbl_gym.studies.placing.lever import lever_row
 from rbl_gym.studies.placing.surveys import survey_rows
 from rbl_gym.studies.progress import Advance, silent
 
@@ -217,7 +218,10 @@ def _result(
         "verdict": verdict(judged),
         "survive": survive,
         "notes": [*problem.notes, *(given_notes(problem, anchors, names) if given else [])],
-        "zones": [zone_row(*pair) for pair in zip(judged, edges, strict=True)],
+        "zones": [
+            zone_row(*pair) | {"lever": lever_row(problem, anchors, pair[0])}
+            for pair in zip(judged, edges, strict=True)
+        ],
         "region": {"low_m": low.tolist(), "high_m": high.tolist()},
         "obstacles": _obstacles(problem),
         "tags_m": problem.tags.tolist(),

@@ -25,6 +25,11 @@ __all__ = ["DrawnBodies", "check_layout", "draw_bodies"]
 _LOST_NEES = float(special.chdtri(6, 1e-6))
 # Ranges below this value (metres) do not count as measured.
 _LEAST_RANGE_M = 1e-3
+# Iterations of the filters. The usual four do not always converge from a prior as vague as that of
+# the check, with precise ranges.
+_ITERATIONS = 20
+# The ranges of a pose fit if a chi-square variable is larger more often than this.
+_FITS = 1e-3
 # Standard deviation of a known tilt, radians.
 _KNOWN_RAD = 1e-6
 # The prediction holds if the ratio of actual to predicted errors of all bodies is at most the first
@@ -98,20 +103,22 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
         laws["iterated EKF, not told"] = (problem.noise, True)
     result = {}
     for name, (law, robust) in laws.items():
-        filter = estimators.IteratedEkf(problem.tags, problem.noise, ProcessNoise(), robust=robust)
+        filter = estimators.IteratedEkf(
+            problem.tags, problem.noise, ProcessNoise(), _ITERATIONS, robust
+        )
         start = drawn.prior_rotation, drawn.prior_translation, drawn.prior
         reading = Reading(drawn.ranges, anchors, drawn.links, law)
         (step,) = track_epochs(filter, start, [reading])
         belief = step.belief
         found = Found(belief.rotation, belief.translation, belief.covariance)
-        result[name] = _figures(problem, drawn, found, with_prior, seed)
+        result[name] = _figures(problem, anchors, drawn, found, with_prior, seed)
     enough = bounds.information_rank(drawn.information) == 6
     known = any(zone.attitude == "heading" for zone in problem.zones)
     if enough.mean() >= 0.9 and not known:
         found = _located(problem, anchors, drawn, enough)
         regular = np.where(enough[:, None, None], drawn.information, np.eye(6))
         bound = np.where(enough[:, None, None], np.linalg.inv(regular), np.nan)
-        result["locate, from nothing"] = _figures(problem, drawn, found, bound, seed)
+        result["locate, from nothing"] = _figures(problem, anchors, drawn, found, bound, seed)
     return {
         "trials": trials,
         "prior_rotation_deg": float(np.rad2deg(problem.scene.initial_rotation_rad)),
@@ -208,12 +215,18 @@ def draw_bodies(
 
 
 def _figures(
-    problem: Problem, drawn: DrawnBodies, found: Found, bound: FloatArray, seed: int
+    problem: Problem,
+    anchors: FloatArray,
+    drawn: DrawnBodies,
+    found: Found,
+    bound: FloatArray,
+    seed: int,
 ) -> dict[str, Any]:
     """Return actual and predicted errors, over all bodies and by zone.
 
     - ``found``: share of the bodies whose pose is not lost (see `_LOST_NEES`).
     - ``without_pose``: share of the bodies without a pose.
+    - ``wrong``: the lost poses, see `_wrong`; None if there are none.
     - ``position_rmse_m``, ``position_predicted_m``, ``position_ratio``: over all bodies with a
       pose.
     - ``position_p95_m``: over all bodies; None if more than 5 % have no pose.
@@ -243,6 +256,7 @@ def _figures(
     kept = known & ~((nees > _LOST_NEES) & (metrics.nees(error, bound) > _LOST_NEES))
     variance = np.einsum("bii->bi", bound)
     result: dict[str, Any] = {"found": float(kept.mean()), "without_pose": float(1 - known.mean())}
+    result["wrong"] = _wrong(problem, anchors, drawn, found, error, known & ~kept)
     for of, rows in (("", known), ("_found", kept)):
         if not rows.any():
             continue
@@ -266,6 +280,38 @@ def _figures(
     )
     result["zones"] = _zones(problem, drawn.zone, error, bound, known, kept, seed)
     return result
+
+
+def _wrong(
+    problem: Problem,
+    anchors: FloatArray,
+    drawn: DrawnBodies,
+    found: Found,
+    error: FloatArray,
+    lost: np.ndarray,
+) -> dict[str, Any] | None:
+    """Return what the wrong poses have in common, to name the cause.
+
+    - ``bodies``: their number; ``zones``: names of the zones that have any.
+    - ``fit``: number of those whose ranges agree with the wrong pose, by a chi-square test. The
+      ranges do not tell such a pose from the true one. The others are false minima.
+    - ``horizontal_m``, ``height_m``: root mean square errors of their positions.
+    """
+    if not lost.any():
+        return None
+    tags = ranging.tag_positions(found.rotation[lost], found.translation[lost], problem.tags)
+    miss = (drawn.ranges[lost] - ranging.distances(anchors, tags)) / drawn.told.std_m[lost]
+    links = drawn.links[lost]
+    square = np.where(links, miss**2, 0.0).sum(axis=(-2, -1))
+    fit = special.chdtrc(links.sum(axis=(-2, -1)), square) > _FITS
+    across, up = (error[lost][:, 3:5] ** 2).sum(-1).mean(), (error[lost, 5] ** 2).mean()
+    return {
+        "bodies": int(lost.sum()),
+        "zones": [problem.zones[k].name for k in np.unique(drawn.zone[lost])],
+        "fit": int(fit.sum()),
+        "horizontal_m": float(np.sqrt(across)),
+        "height_m": float(np.sqrt(up)),
+    }
 
 
 _PARTS = (("position", slice(3, 6), "m", 1.0), ("rotation", slice(3), "deg", 180 / np.pi))
