@@ -114,3 +114,21 @@ def test_a_missing_library_is_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr("rbl_gym.app.place_command._place", missing)
     assert said(capsys, "place", "--scene", "uwb_room").startswith("rbl-gym place: files with")
+
+
+def test_a_value_with_a_minus_sign_in_front(capsys):
+    error = said(capsys, "replay", *FILES, "--start", "-1,2,0.5")
+    assert "expected one argument; with a minus sign in front, write --start=-1,2,0.5" in error
+
+
+def test_folders_that_a_command_makes_are_named(tmp_path, capsys):
+    track = tmp_path / "new" / "track.tum"
+    assert cli.main(["replay", *FILES, "--track", str(track)]) == 0
+    assert f"made the folder {track.parent}" in capsys.readouterr().err
+    assert cli.main(["replay", *FILES, "--track", str(track)]) == 0
+    assert "made the folder" not in capsys.readouterr().err
+
+
+def test_a_survey_names_its_own_option_of_the_height(capsys):
+    error = said(capsys, "calibrate", *FILES, "--planar", "--height-m", "1")
+    assert "--height-offset-m" in error

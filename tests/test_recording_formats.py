@@ -558,3 +558,11 @@ def test_a_recording_made_of_arrays_has_an_empty_report(tmp_path):
     assert bare.report == Report() == Report(0, {}, 0, ())
     assert bare.anchors_by_epoch.shape == (2, 3, 3)
     np.testing.assert_array_equal(bare.anchors_by_epoch[1], bare.anchors)
+
+
+def test_an_anchor_that_is_missing_gives_a_warning(tmp_path):
+    text = many(95) + "".join(f"{9.5 + 0.1 * k:.1f},E,1,2\n" for k in range(5))
+    (note,) = [note for note in read(tmp_path, text).report.notes if "left out" in note]
+    assert note.startswith("WARNING: ")
+    assert "(E)" in note
+    assert "add it to the table of anchors" in note

@@ -7,12 +7,14 @@ import pytest
 
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings import Truth
+from rbl_gym.recordings import Files, Truth, read_recording
 from rbl_gym.studies import replay
+from rbl_gym.studies.replay import study
 from rbl_gym.studies.replay.centre import about_origin
 from rbl_gym.studies.replay.observed import Observed, observed
 from rbl_gym.studies.replay.place import start_of
 from tests import recorded
+from tests.helpers import ROOT
 
 ANCHORS = np.array([[0.0, 0, 0], [6, 0, 3], [6, 5, 0], [0, 5, 3], [3, 0, 3], [3, 5, 0.5]])
 
@@ -180,3 +182,16 @@ def test_a_start_is_the_prior():
 def test_what_contradicts_itself_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         replay.Settings.of(**options)
+
+
+@pytest.mark.parametrize(("nees", "shown"), [(0.3, True), (1.01, False)])
+def test_noise_is_not_called_too_large_if_the_errors_are_as_large(monkeypatch, nees, shown):
+    """A NIS below 0.7 with a NEES near 1: the covariance of the track is right."""
+    log = ROOT / "examples" / "log"
+    names = ("ranges", "anchors", "tags", "truth")
+    files = Files(**{name: log / f"{name}.csv" for name in names})
+    figures = study.track_figures
+    monkeypatch.setattr(study, "track_figures", lambda *given: {**figures(*given), "anees": nees})
+    found = study.replay_recording(read_recording(files), replay.Settings.of())
+    assert found.figures["consistency"]["nis_per_dof"] < 0.7
+    assert any("assumed noise" in note for note in found.figures["notes"]) == shown

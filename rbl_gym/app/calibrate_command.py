@@ -197,6 +197,11 @@ def _calibrate(options: argparse.Namespace) -> int:
     if options.imu is not None and not options.truth:
         raise ValueError("--imu needs --truth")
     mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
+    if options.height_m is not None and not options.truth:
+        raise ValueError(
+            "--height-m needs --truth; a survey with --planar takes --height-offset-m, the depth "
+            "of the tags below the anchors"
+        )
     if wrong := [option for name, option in others.items() if getattr(options, name) is not None]:
         raise ValueError(
             f"{wrong[0]} {'must be left out with' if options.truth else 'needs'} --truth"

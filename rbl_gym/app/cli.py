@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import atexit
 import gc
 import logging
@@ -95,7 +96,11 @@ def _run(arguments: Sequence[str] | None) -> int:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
+        absent = _absent_folders(options)
         status = options.run(options)
+        for folder in absent:
+            if os.path.isdir(folder):
+                print(f"rbl-gym {options.command}: made the folder {folder}", file=sys.stderr)
         _flush()
         return status
     except BrokenPipeError:
@@ -107,6 +112,13 @@ def _run(arguments: Sequence[str] | None) -> int:
         said = with_options(str(error), options, arguments)
         print(f"rbl-gym {options.command}: {said}", file=sys.stderr)
     return 2
+
+
+def _absent_folders(options: argparse.Namespace) -> list[str]:
+    """Return the folders of the files to write that do not exist yet."""
+    paths = (getattr(options, name, None) for name in ("track", "plot", "html", "json"))
+    folders = (os.path.dirname(path) for path in paths if isinstance(path, str))
+    return [folder for folder in dict.fromkeys(folders) if folder and not os.path.exists(folder)]
 
 
 def _parser(command: str = "") -> Parser:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbl_gym.app.tables import new_table
+from rbl_gym.checks import FloatArray
 from rbl_gym.studies.replay import Replayed, nis_curve
 from rbl_gym.studies.replay.figures import gaps_of
 
@@ -70,9 +72,7 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     found = replayed.track.innovations
     assert found is not None
     times = replayed.track.times
-    curve = nis_curve(times - times[0], found)
-    gaps = gaps_of(curve[0]) + 1
-    when, ratio, low, high = (np.insert(values, gaps, np.nan) for values in curve)
+    when, ratio, low, high = _broken(nis_curve(times - times[0], found))
     axes.fill_between(when, low, high, color="0.85", lw=0, label="95 % of a consistent filter")
     ratio = np.clip(ratio, 1e-3, 1e6)
     axes.plot(when, ratio, color=_HONEST, lw=0.8)
@@ -86,6 +86,12 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     # Above the panel, where no curve is.
     axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2)
     axes.grid(True)
+
+
+def _broken(curve: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return the arrays of a curve, times first, with NaN in each gap without ranges."""
+    gaps = gaps_of(curve[0]) + 1
+    return [np.insert(values, gaps, np.nan) for values in curve]
 
 
 def consistency_parts(replayed: Replayed) -> list[str]:
@@ -138,7 +144,7 @@ def _charts(replayed: Replayed) -> Any:
 
     track, found = replayed.track, replayed.track.innovations
     assert found is not None
-    when, ratio, low, high = nis_curve(track.times - track.times[0], found)
+    when, ratio, low, high = _broken(nis_curve(track.times - track.times[0], found))
     shown = make_subplots(
         1,
         3,
@@ -146,9 +152,15 @@ def _charts(replayed: Replayed) -> Any:
         horizontal_spacing=0.13,
         subplot_titles=["NIS per degree of freedom", "mean residual (m)", "rejected (%)"],
     )
-    for values, fill in ((high, None), (low, "tonexty")):
+    # The area between two curves ignores breaks: one closed area for each part.
+    for part in np.split(np.arange(len(when)), np.flatnonzero(np.isnan(when))):
+        part = part[np.isfinite(when[part])]
+        around = np.concatenate([part, part[::-1]])
+        edge = np.concatenate([high[part], low[part[::-1]]])
         style: dict[str, Any] = {"mode": "lines", "line": {"color": _BAND, "width": 0}}
-        shown.add_scatter(x=when, y=values, fill=fill, hoverinfo="skip", row=1, col=1, **style)
+        shown.add_scatter(
+            x=when[around], y=edge, fill="toself", hoverinfo="skip", row=1, col=1, **style
+        )
     line = {"color": _HONEST, "width": 1.2}
     shown.add_scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line, row=1, col=1)
     shown.update_yaxes(type="log", dtick=1, row=1, col=1)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
+import sys
 import textwrap
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from rbl_gym.checks import did_you_mean
 
+_NO_VALUE = re.compile(r"argument (\S+): expected one argument")
 _CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")
 
 
@@ -40,9 +43,11 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{"formatter_class": _Help, **kwargs})
+        self._typed: list[str] = []
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Parse; raise an error here for an unknown option, so that it names the command."""
+        self._typed = [*(sys.argv[1:] if args is None else args)]
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             name = unknown[0].partition("=")[0]
@@ -54,8 +59,18 @@ class Parser(argparse.ArgumentParser):
         """Print the message in one line, without the usage, and exit with status 2."""
         if found := _CHOICE.search(message):
             message += did_you_mean(found[1], [name.strip("'") for name in found[2].split(", ")])
+        if found := _NO_VALUE.search(message):
+            message += self._negative(found[1].split("/"))
         end = "" if message[-1] in ".?" else "."
         self.exit(2, f"{self.prog}: {message}{end} Help: {self.prog} --help\n")
+
+    def _negative(self, names: Sequence[str]) -> str:
+        """Return how to write an option whose value begins with a minus sign."""
+        for option, value in itertools.pairwise(self._typed):
+            same = option[:2] == "--" and any(name.startswith(option) for name in names)
+            if same and re.match(r"-[\d.]", value):
+                return f"; with a minus sign in front, write {option}={value}"
+        return ""
 
 
 def with_options(message: str, given: argparse.Namespace, arguments: Sequence[str]) -> str:

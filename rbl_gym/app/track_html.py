@@ -294,7 +294,8 @@ def _world(story: Story) -> dict[str, Any]:
     shape = size / size.max()
     # Flat worlds have room to be shown larger.
     ratio = dict(zip("xyz", (shape / np.prod(shape) ** (1 / 6)).tolist(), strict=True))
-    camera = {"eye": {"x": 0.85, "y": -1.45, "z": 0.85}, "center": {"x": 0, "y": 0, "z": -0.1}}
+    # From far enough that the labels of the z axis fit.
+    camera = {"eye": {"x": 1.0, "y": -1.7, "z": 1.0}, "center": {"x": -0.08, "y": 0, "z": -0.1}}
     return {"aspectmode": "manual", "aspectratio": ratio, "camera": camera, **scene}
 
 

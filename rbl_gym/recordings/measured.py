@@ -44,6 +44,8 @@ _CAUSES = {
     ),
 }
 _NAMES = [*_CAUSES]
+# More ranges than this share without an anchor or a tag give a warning.
+_MANY = 0.01
 # Advice if one cause prevails.
 _HINTS = {
     "too long": "are the ranges in cm or mm? set --unit",
@@ -320,7 +322,10 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         causes = ", ".join(
             f"{n} {cause}{_unknown_ids(measured, table, cause)}" for cause, n in shown.items()
         )
-        said.note(table.path, f"{sum(shown.values())} of {total} ranges are left out: {causes}")
+        text = f"{sum(shown.values())} of {total} ranges are left out: {causes}"
+        missing = {c: n for c, n in shown.items() if "unknown" in c and n > _MANY * total}
+        hints = "".join(f"; {_HINTS[cause]}" for cause in missing if cause in _HINTS)
+        said.note(table.path, text + hints, warn=bool(missing))
 
 
 def _in_file(table: Table, column: str) -> str:

@@ -25,7 +25,7 @@ class Report:
     sorted_rows
         Number of rows that were out of order, by one second at most.
     notes
-        Notes for the user, one sentence each.
+        Notes for the user, one sentence each; serious ones begin with ``WARNING``.
     """
 
     ranges: int = 0
@@ -44,10 +44,10 @@ class Said:
         self.notes: list[str] = []
         self._unread: dict[str, tuple[str, set[str]]] = {}
 
-    def note(self, path: str, text: str) -> None:
-        """Add a note on a file; an empty sentence is ignored."""
+    def note(self, path: str, text: str, *, warn: bool = False) -> None:
+        """Add a note on a file, or a warning; an empty sentence is ignored."""
         if text:
-            self.notes.append(f"{path}: {text}.")
+            self.notes.append(f"{'WARNING: ' if warn else ''}{path}: {text}.")
 
     def drop(self, cause: str, count: int) -> None:
         """Count ranges that do not become a link."""

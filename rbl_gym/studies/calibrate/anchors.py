@@ -306,7 +306,7 @@ def _result(
             f"{survey.bias_std_m:.3f} m); give bias_m and bias_std_m, or a known pair of anchors"
         )
     if settings.planar:
-        said.append("heights: all anchors and tags are assumed at one height")
+        said.append("heights: the heights are held")
     arms = recording.tags - recording.tags.mean(axis=0)
     rank = np.linalg.matrix_rank(arms[:, : 2 if settings.planar else 3], tol=1e-3)
     if rank < (2 if settings.planar else 3) and known.sum() < 3 and settings.start == "ranges":

@@ -16,8 +16,9 @@ from rbl_gym.studies.replay.consistency import (
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import Track
 
-# Below this NIS per degree of freedom the filter is pessimistic.
-_WIDE = 0.7
+# Below this NIS or NEES per degree of freedom the filter is pessimistic.
+WIDE = 0.7
+WIDE_NOTE = "Note: the assumed noise of the ranges looks too large"
 
 
 def diagnose(
@@ -30,18 +31,18 @@ def diagnose(
     ratio = figures["nis_per_dof"]
     if not figures["contradicts"]:
         notes = []
-        if ratio < _WIDE:
+        if ratio < WIDE:
             notes.append(
-                "Note: the assumed noise of the ranges looks too large for this log (NIS per "
-                f"degree of freedom {ratio:.2f}, 1: consistent), unless the errors of a link are "
-                "correlated in time. Try --tune or a smaller --range-std-m."
+                f"{WIDE_NOTE} for this log (NIS per degree of freedom {ratio:.2f}, 1: consistent), "
+                "unless the errors of a link are correlated in time. "
+                "Try --tune or a smaller --range-std-m."
             )
         return {**figures, "causes": []}, notes
     if recording.offset is not None:
         # The tested faults concern ranges, not their differences.
         text = _subject(figures) + "Look at the residuals of anchors, tags and links; see --tune."
         return {**figures, "causes": []}, [text]
-    if (usual := typical_square(found, recording)) < _WIDE:
+    if (usual := typical_square(found, recording)) < WIDE:
         # With the assumed noise no fault would be likely.
         recording, settings = _with_less_noise(recording, settings, math.sqrt(usual))
     causes = likely_causes(recording, settings, found, track[1:3])

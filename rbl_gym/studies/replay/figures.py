@@ -188,7 +188,10 @@ def _with_reading(recording: Recording, notes: list[str]) -> dict[str, Any]:
             "dropped": report.dropped,
             "sorted_rows": report.sorted_rows,
         },
-        "notes": [*(f"Note: {note}" for note in report.notes), *notes],
+        "notes": [
+            *(note if note.startswith("WARNING") else f"Note: {note}" for note in report.notes),
+            *notes,
+        ],
     }
 
 

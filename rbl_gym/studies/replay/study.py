@@ -10,7 +10,7 @@ import numpy as np
 from rbl_gym.recordings import TimeOffset
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.progress import Advance, silent
-from rbl_gym.studies.replay.diagnosis import diagnose
+from rbl_gym.studies.replay.diagnosis import WIDE, WIDE_NOTE, diagnose
 from rbl_gym.studies.replay.figures import smoothed_figures, track_figures, wide_note
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
@@ -115,6 +115,9 @@ def replay_recording(
         lags = smoothed is None
         figures["time_offset"] = {**offset._asdict(), "track": "causal" if lags else "smoothed"}
     figures["consistency"], notes = diagnose(recording, settings, track)
+    if figures.get("anees", 0.0) > WIDE:
+        # The errors are as large as the covariance says: it is not too large.
+        notes = [note for note in notes if not note.startswith(WIDE_NOTE)]
     figures["notes"] = figures["notes"] + ([] if offset is None else _offset_note(offset)) + notes
     if smoothed is None:
         return Replayed(settings, track, errors, figures)
