@@ -273,7 +273,8 @@ def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     # Clock times are drawn since the start of the log.
     since = log.times - log.times[0]
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_xdata()), since, atol=1e-6)
-    assert 0 <= min(chart.data[2].x) < max(chart.data[2].x) <= since[-1]
+    line = [trace for trace in chart.data if trace.type == "scatter"][-1]
+    assert 0 <= min(line.x) < max(line.x) <= since[-1]
     found = replayed.track.innovations
     assert found is not None
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_ydata()), found.nis / found.dof)
