@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rbl_gym import estimators, metrics, motion, recordings
+from rbl_gym.app.cli import main
 from rbl_gym.estimators import smoothing
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.geometry import rotations
@@ -344,6 +346,20 @@ def test_the_clock_of_the_odometry_by_the_likelihood():
 
 
 @with_kernels
+def test_the_estimated_clock_is_printed_without_truth(tmp_path, capsys):
+    log: Any = a_log(K=80, ahead=0.4)
+    ranges = np.where(log.links, log.ranges, np.nan)
+    files = recorded.files(tmp_path, log.anchors, log.tags, log.times, ranges)
+    rows = np.c_[log.odometry.times, log.odometry.readings[:, [3, 2]]]
+    files["odometry"] = recorded.table(tmp_path / "odometry.csv", "t,vx,wz", rows)
+    how = ["--planar", "--height-m", "0", "--range-std-m", "0.05"]
+    assert main(["replay", *recorded.options(files), *how, "--time-offset", "odometry=auto"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    found = re.search(r"the clock of --odometry is ahead by (\S+) s \+- (\S+) s", printed)
+    assert found is not None
+    assert abs(float(found[1]) - 0.4) < 4 * float(found[2])
+
+
 def test_tuning_finds_the_noise_of_the_odometry():
     log = a_log(K=25)
     rough = SETTINGS.changed(odometry_m=0.5, odometry_deg=60.0, start=START)
@@ -413,6 +429,23 @@ def test_a_track_by_an_inertial_sensor_is_smoothed():
         square = [np.mean(getattr(errors, name) ** 2) for errors in (causal, smoothed)]
         assert square[1] < 0.5 * square[0]
     assert 0.3 < np.mean(smoothed.nees) / smoothed.freedom < 2.5
+
+
+@pytest.mark.parametrize("sensor", ["odometry", "inertial"])
+def test_the_smoother_keeps_a_planar_body_level_with_a_sensor(sensor):
+    """Held within 1 mm and 1 mrad, as by the filter."""
+    log: Any = an_inertial_log()
+    settings = INERTIAL.changed(planar=True, height_m=0.8)
+    if sensor == "odometry":
+        # Wheels that measure the turn rate and the speed along y.
+        told = np.tile([np.nan, np.nan, 0.8, np.nan, 1.2, np.nan], (len(log.times), 1))
+        log = log._replace(inertial=None, odometry=OdometryLog(log.times, told))
+        settings = SETTINGS.changed(height_m=0.8, range_std_m=0.03)
+    found: Any = replay.replay_recording(log, settings.changed(smooth=True))
+    track = found.smoothed.track
+    assert found.smoothed.found.converged
+    assert np.abs(track.rotation[:, :2, 2]).max() < 1e-3
+    assert np.abs(track.translation[:, 2] - settings.knowledge.height_m).max() < 1e-3
 
 
 def test_ranges_that_state_their_deviations_count_by_a_share():

@@ -110,6 +110,8 @@ def print_replay(result: dict[str, Any]) -> None:
         )
     if "epochs_with_truth" not in result:
         console.print("no truth, so no errors")
+        for line in sensor_clocks(result):
+            console.print(line)
         print_consistency(console, result)
         _print_notes(console, result)
         return
@@ -211,14 +213,9 @@ def _print_runs(
     console.print(table)
 
 
-def compared(result: dict[str, Any]) -> list[str]:
-    """Return how the track of a recording was aligned with its truth, in lines."""
-    parts = [
-        f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth "
-        f"({result['truth_format']})"
-    ]
-    if "epochs_excluded" in result:
-        parts.append(f"{result['epochs_excluded']} further epochs are excluded (truth_exclude)")
+def sensor_clocks(result: dict[str, Any]) -> list[str]:
+    """Return the estimated clock offsets of sensors, in lines."""
+    parts = []
     for what in ("odometry", "imu"):
         if (found := result.get(f"{what}_clock")) is None:
             continue
@@ -233,6 +230,18 @@ def compared(result: dict[str, Any]) -> list[str]:
             f"the clock of --{what} is ahead by {found['offset_s']:.3f} s "
             f"+- {found['std_s']:.3f} s by {how}"
         )
+    return parts
+
+
+def compared(result: dict[str, Any]) -> list[str]:
+    """Return how the track of a recording was aligned with its truth, in lines."""
+    parts = [
+        f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth "
+        f"({result['truth_format']})"
+    ]
+    if "epochs_excluded" in result:
+        parts.append(f"{result['epochs_excluded']} further epochs are excluded (truth_exclude)")
+    parts += sensor_clocks(result)
     if "time_offset" in result:
         found = result["time_offset"]
         parts.append(

@@ -20,6 +20,8 @@ _MAP_M = 1e4
 START_M, _START_DEG = 0.5, 30.0
 # Standard deviations of height (m), roll and pitch (rad) under the planar constraint.
 _PLANAR_STD = 1e-3
+# Correlation time (s) below the spacing of epochs.
+_EVERY_S = 1e-6
 # Anchors with heights within this margin are in one plane.
 _PLANE_M = 0.1
 
@@ -120,6 +122,14 @@ def level_of(settings: Settings, origin: FloatArray) -> Level | None:
     if known.tilt_std_deg is not None:
         tilt = math.radians(known.tilt_std_deg)
     return Level(height, known.height_std_m, tilt)
+
+
+def plane_of(recording: Recording, settings: Settings) -> Level:
+    """Return the planar constraint, at every epoch, on height and tilt relative to `origin_of`."""
+    _, place, _ = start_of(recording, settings)
+    height = float(place[2] - origin_of(recording)[2])
+    # Every epoch has full weight.
+    return Level(height, _PLANAR_STD, _PLANAR_STD, time_s=_EVERY_S)
 
 
 def has_own_std(recording: Recording, settings: Settings) -> bool:

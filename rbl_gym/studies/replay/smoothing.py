@@ -22,7 +22,7 @@ from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.groups import beliefs_of
 from rbl_gym.studies.replay.centre import about_origin, centred
 from rbl_gym.studies.replay.mirror import covering
-from rbl_gym.studies.replay.place import level_of, origin_of, own_std, start_of
+from rbl_gym.studies.replay.place import level_of, origin_of, own_std, plane_of, start_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import (
     Track,
@@ -130,6 +130,9 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
         _along(shift, laws.smooth_accel_m),
     )
     motion = smoothing.UnknownTwist(wander)
+    if planar and not (recording.odometry is None and recording.inertial is None):
+        # A sensor replaces the twist, whose law holds height and tilt.
+        level = plane_of(recording, settings)
     if recording.odometry is not None:
         told = smoothing.padded(readings_of(recording, settings))
         motion = smoothing.OdometryMotion(*told, settings.odometry.sensor())
