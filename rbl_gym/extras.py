@@ -16,6 +16,11 @@ def require(module: str, extra: str, what: str, also: str = "", instead: str = "
     done.
     """
     if importlib.util.find_spec(module) is None:
-        install = f"pip install 'rbl-gym[{extra}]' {also}".rstrip()
         choice = f", or {instead}" if instead else ""
-        raise MissingExtraError(f"{what} needs the extra {extra}: {install}{choice}", name=module)
+        text = f"{what} needs the extra {extra}: {installation(extra)} {also}".rstrip()
+        raise MissingExtraError(text + choice, name=module)
+
+
+def installation(extra: str) -> str:
+    """Return the command that installs an extra."""
+    return f"pip install 'rbl-gym[{extra}]'"

@@ -187,7 +187,7 @@ def test_the_command_writes_anchors_that_replay_reads(tmp_path, capsys):
     arguments = ["calibrate", *recorded.options(files)]
     arguments += ["--planar", "--height-offset-m", "0.3", "--anchor-ranges", str(pairs)]
     assert main([*arguments, "--out", str(out), "--plot", str(plot)]) == 0
-    said = capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.split())
     assert "correlation of the two" in said
     assert plot.stat().st_size > 10_000
     read = read_recording(

@@ -9,7 +9,7 @@ from typing import Any
 
 from rbl_gym.app.terminal import add_json, add_seed, positive, progress, write_json
 from rbl_gym.checks import check_one_of
-from rbl_gym.extras import require
+from rbl_gym.extras import installation, require
 from rbl_gym.studies.learning.own_policies import OwnPolicy, PolicyLike, policy_like
 from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
 from rbl_gym.studies.learning.training import ALGORITHMS
@@ -195,7 +195,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     named = _references(options, task, [])
     _require_searches({*named})
     if skipped := left_out(evaluation.references(task), named):
-        print(f"skipped: {', '.join(skipped)}: pip install 'rbl-gym[placement]'", file=sys.stderr)
+        print(f"skipped: {', '.join(skipped)}: {installation('placement')}", file=sys.stderr)
     names = named or None
     with progress(title) as advance:
         result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
