@@ -17,6 +17,12 @@ settings.load_profile("rbl")
 logging.getLogger("rbl_gym.kernels").setLevel(logging.WARNING)
 
 
+@pytest.fixture(autouse=True)
+def _width_of_no_terminal(monkeypatch):
+    """Tables as a pipe prints them, also if the shell exports the width of its terminal."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+
 def pytest_addoption(parser):
     parser.addoption(
         "--cases",

@@ -146,7 +146,8 @@ def test_place(capsys):
     found = accuracy.accuracy(problem, placed.design.anchors, judged.places, problem.zones[0])
     assert float(monte_carlo.rms(found.score)) == placed.result["predicted"]["score_m"]["rms"]
     edges = judging.at_edges(problem, placed.design.anchors, judged)
-    assert judging.zone_row(judged, edges) == placed.result["zones"][0]
+    row = placed.result["zones"][0]
+    assert judging.zone_row(judged, edges) == {key: row[key] for key in row if key != "lever"}
     assert judging.overview([judged], [edges]) == placed.result["predicted"]
 
 

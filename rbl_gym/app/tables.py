@@ -24,7 +24,7 @@ def new_console(width: int | None = 130) -> Any:
     if not has_rich():
         return _PlainConsole()
     # Piped tables keep all of their columns, unless a width is requested.
-    width = None if rich_console().is_terminal or "COLUMNS" in os.environ else width
+    width = None if rich_console().is_terminal or bool(os.environ.get("COLUMNS")) else width
     return rich_console(width=width, highlight=False, markup=False)
 
 
@@ -77,7 +77,7 @@ class _PlainConsole:
 
 def _plain_width() -> int:
     """Return the width of the terminal, or that of the variable COLUMNS; no limit without both."""
-    limited = sys.stdout.isatty() or "COLUMNS" in os.environ
+    limited = sys.stdout.isatty() or bool(os.environ.get("COLUMNS"))
     return shutil.get_terminal_size().columns if limited else sys.maxsize
 
 
