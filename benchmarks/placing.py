@@ -14,16 +14,13 @@ from __future__ import annotations
 
 import side_by_side  # noqa: F401  # isort: skip (sets the number of threads)
 
-import argparse
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from trees import as_line, in_tree, read_options
 
 PLACES, CONTEXTS = 6000, 64
 Tables = dict[str, Any]
@@ -95,16 +92,7 @@ CASES: dict[str, Tables] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("other", nargs="?", help="a worktree of commit 282192e")
-    parser.add_argument("--cases", default=",".join(CASES), help="of " + ", ".join(CASES))
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--measure", metavar="CASE", help=argparse.SUPPRESS)
-    parser.add_argument("--seed", type=int, default=0, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = read_options(__doc__, CASES)
     if options.measure:
         print(json.dumps(measure(options.measure, options.seed)))
         return
@@ -112,7 +100,7 @@ def main() -> None:
     trees = {"other": Path(options.other).resolve(), "ours": Path(__file__).resolve().parents[1]}
     for name in filter(None, options.cases.split(",")):
         for seed in range(options.seeds):
-            found = {key: in_tree(tree, name, seed) for key, tree in trees.items()}
+            found = {key: in_tree(__file__, tree, name, seed) for key, tree in trees.items()}
             b = {key: judge(CASES[name], np.array(row["anchors"])) for key, row in found.items()}
             row = {"case": name, "seed": seed}
             row |= {f"b_{key}_m": value for key, value in b.items()}
@@ -120,32 +108,15 @@ def main() -> None:
             row |= {"b_ratio": b["ours"] / b["other"]}
             row |= {"time_ratio": row["ours_s"] / row["other_s"]}
             rows.append(row)
-            print(show(row), flush=True)
-    few, many = (in_tree(trees["ours"], f"obstacles{n}", 0)["seconds"] for n in (40, 400))
+            print(as_line(row), flush=True)
+    few, many = (in_tree(__file__, trees["ours"], f"obstacles{n}", 0)["seconds"] for n in (40, 400))
     rows.append({"case": "400 obstacles over 40", "time_ratio": many / few})
-    print(show(rows[-1]), flush=True)
+    print(as_line(rows[-1]), flush=True)
     for scene, racks in (("auv_buoys", 0), ("drone_yard", 0), ("uwb_room", 2)):
         rows.append({"case": scene, **contexts(scene, racks)})
-        print(show(rows[-1]), flush=True)
+        print(as_line(rows[-1]), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps(rows, indent=1))
-
-
-def show(row: Tables) -> str:
-    return "  ".join(
-        f"{key} {value:.4f}" if isinstance(value, float) else f"{key} {value}"
-        for key, value in row.items()
-    )
-
-
-def in_tree(tree: Path, name: str, seed: int) -> Tables:
-    """What `measure` says in a process that imports from this tree."""
-    command = [sys.executable, __file__, "--measure", name, "--seed", str(seed)]
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
-    done = subprocess.run(
-        command, env=environment, cwd=tree, capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def measure(name: str, seed: int) -> Tables:

@@ -13,16 +13,13 @@ from __future__ import annotations
 
 import side_by_side  # noqa: F401  # isort: skip (sets the number of threads)
 
-import argparse
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from trees import as_line, in_tree, read_options
 
 ROOT = Path(__file__).resolve().parents[1]
 SETS = 8
@@ -178,26 +175,8 @@ def usual_b(row: Tables, seed: int) -> tuple[float, int]:
     return min(one["b_m"] for one in found), max(one["passed"] for one in found)
 
 
-def in_tree(tree: Path, name: str, seed: int) -> Tables:
-    command = [sys.executable, __file__, "--measure", name, "--seed", str(seed)]
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
-    done = subprocess.run(
-        command, env=environment, cwd=tree, capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout.splitlines()[-1])
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("other", nargs="?", help="a worktree of the other commit")
-    parser.add_argument("--cases", default=",".join(CASES), help="of " + ", ".join(CASES))
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--measure", metavar="CASE", help=argparse.SUPPRESS)
-    parser.add_argument("--seed", type=int, default=0, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = read_options(__doc__, CASES)
     if options.measure:
         print(json.dumps(measure(CASES[options.measure], options.seed)))
         return
@@ -209,18 +188,12 @@ def main() -> None:
         for seed in range(options.seeds):
             best, most = usual_b(CASES[name], seed)
             for tree, path in trees.items():
-                found = in_tree(path, name, seed)
+                found = in_tree(__file__, path, name, seed)
                 told = judge(CASES[name], np.array(found["anchors"]))
                 row = {"case": name, "seed": seed, "tree": tree, **told}
                 row |= {"usual_b_m": best, "usual_passed": most, "seconds": found["seconds"]}
                 rows.append(row)
-                print(
-                    "  ".join(
-                        f"{key} {value:.4f}" if isinstance(value, float) else f"{key} {value}"
-                        for key, value in row.items()
-                    ),
-                    flush=True,
-                )
+                print(as_line(row), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps(rows, indent=1))
 

@@ -247,7 +247,7 @@ class Standstill(Wrapped):
             "the same as a filter made with this LinkNoise: .* differs by",
         ),
         (KeepsTheNoise, "noise", "the noise of one update must not be used in the next"),
-        (SwallowsNan, "nan", "on NaN in ranges, raised nothing. Call check_prior .*skip=..nan"),
+        (SwallowsNan, "nan", "on NaN in ranges, raised nothing. The page .*skip=..nan"),
         (WrongErrorOnNan, "nan", r"NaN in twist, raised RuntimeError\('nan'\)"),
         (Boastful, "nees", "got [0-9.]+: errors are larger than claimed"),
         (Standstill, "nees", "beliefs must be consistent|smaller than that of the prior"),

@@ -44,9 +44,8 @@ class Epochs(NamedTuple):
 
 # End of the message of a filter that accepts NaN.
 NAN_ADVICE = (
-    ". Call check_prior in initial and check_epoch in update, both of rbl_gym.estimators.inputs, "
-    "and rbl_gym.checks.check_array in predict; or leave this check out: "
-    'check_filter(..., skip=["nan"])'
+    ". The page 'Your own estimator' names the functions that check the arguments of each method; "
+    'or leave this check out: check_filter(..., skip=["nan"])'
 )
 
 
