@@ -20,11 +20,13 @@ CORNERS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
 
 def recording(times, ranges, anchors, tags, truth=None, **more) -> Recording:
     """Ranges (K, M, N), measured where above 0; anchors A0, A1, ..., tags T0, T1, ..."""
-    ids = (
+    anchor_ids, tag_ids = (
         tuple(f"{letter}{k}" for k in range(ranges.shape[axis]))
         for letter, axis in (("A", 1), ("T", 2))
     )
-    return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, truth, **more)
+    return Recording(
+        times, ranges, ranges > 0, None, anchors, tags, anchor_ids, tag_ids, truth, **more
+    )
 
 
 def flight(tags, move=lambda times: ROOM, biases=0.0, count=60, shift=0.0) -> Recording:

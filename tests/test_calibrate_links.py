@@ -270,10 +270,11 @@ def test_a_truth_that_repeats_a_pose_and_jumps_does_not_tell_the_clock():
     """A tracker lost the body for 0.44 s. What it repeated is interpolated."""
     times, on_truth = 0.05 * np.arange(600), 0.01 * np.arange(3100)
     ranges = ranges_of(times, np.random.default_rng(4))
-    truth = Truth(on_truth + 0.3, *path_of(on_truth))
+    rotation, translation = path_of(on_truth)
+    truth = Truth(on_truth + 0.3, rotation, translation)
     held = np.arange(3100)
     held[1500:1544] = 1500
-    frozen = Truth(truth.times, truth.rotation[held], truth.translation[held])
+    frozen = Truth(truth.times, rotation[held], translation[held])
     settings = LinkSettings(tags="held")
     whole, found = (
         calibrate.calibrate_links(recording_of(times, ranges, one), settings).clock

@@ -1,5 +1,7 @@
 """Units in brackets after the names of columns, in headers and in `Format.columns`."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from rbl_gym.recordings.tables import Source
 from tests.helpers import ROOT
 
 LOG = ROOT / "examples" / "log"
-FILES = {name: LOG / f"{name}.csv" for name in ("ranges", "anchors", "tags")}
+FILES: dict[str, Any] = {name: LOG / f"{name}.csv" for name in ("ranges", "anchors", "tags")}
 
 
 def written(path, text):
@@ -65,6 +67,7 @@ def test_the_error_of_large_speeds_names_the_option(tmp_path):
         read_recording(Files(**FILES, odometry=odometry), format=Format(columns=columns))
     columns = {"odometry.vx": "speed[mm/s]"}
     log = read_recording(Files(**FILES, odometry=odometry), format=Format(columns=columns))
+    assert log.odometry is not None
     np.testing.assert_allclose(log.odometry.readings[:, 3], 1.5)
 
 
@@ -81,7 +84,10 @@ def test_positions_in_millimetres_name_the_option(tmp_path):
     rows = (LOG / "anchors.csv").read_text(encoding="utf-8").splitlines()
     cells = [row.split(",") for row in rows[1:]]
     many = [",".join([row[0], *(repr(1000 * float(x)) for x in row[1:4])]) for row in cells]
-    files = {**FILES, "anchors": written(tmp_path / "a.csv", "\n".join(["anchor,x,y,z", *many]))}
+    files: dict[str, Any] = {
+        **FILES,
+        "anchors": written(tmp_path / "a.csv", "\n".join(["anchor,x,y,z", *many])),
+    }
     option = ",".join(f"anchors.{axis}=NAME[mm]" for axis in "xyz")
     with pytest.raises(ValueError, match="cm or mm") as error:
         read_recording(Files(**files))
@@ -97,6 +103,7 @@ def test_a_heading_of_the_truth_names_the_option(tmp_path):
     assert any("--columns truth.yaw_deg=heading or" in note for note in notes)
     columns = {"truth.yaw_deg": "heading"}
     log = read_recording(Files(**FILES, truth=truth), format=Format(columns=columns))
+    assert log.truth is not None
     assert log.truth.rotation is not None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -189,7 +191,8 @@ def test_noise_is_not_called_too_large_if_the_errors_are_as_large(monkeypatch, n
     """A NIS below 0.7 with a NEES near 1: the covariance of the track is right."""
     log = ROOT / "examples" / "log"
     names = ("ranges", "anchors", "tags", "truth")
-    files = Files(**{name: log / f"{name}.csv" for name in names})
+    given: dict[str, Any] = {name: log / f"{name}.csv" for name in names}
+    files = Files(**given)
     figures = study.track_figures
     monkeypatch.setattr(study, "track_figures", lambda *given: {**figures(*given), "anees": nees})
     found = study.replay_recording(read_recording(files), replay.Settings.of())

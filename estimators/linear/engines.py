@@ -129,9 +129,9 @@ def update_means(
 
     NaN for trials with a range that is not positive or not finite.
     """
-    sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))[:, None]
+    sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))
     found = update_mean.textbook(means, P, ranges, anchors, tags, weights)
-    return np.where(sound, found, np.nan)
+    return np.where(np.expand_dims(sound, -1), found, np.nan)
 
 
 @compiled("linear_filter:is_vague")

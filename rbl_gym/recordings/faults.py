@@ -64,12 +64,10 @@ def _readers(
 
     def ranges() -> None:
         table = read_table(files.ranges, format.of("ranges"))
-        points = [read.get(name) for name in ("anchors", "tags")]
-        if all(
-            known is not None or getattr(files, name) is None
-            for known, name in zip(points, ("anchors", "tags"), strict=True)
-        ):
-            read_log(table, *points, format, Said())
+        anchors, tags = read.get("anchors"), read.get("tags")
+        missing = anchors is None and files.anchors is not None
+        if not missing and (tags is not None or files.tags is None):
+            read_log(table, anchors, tags, format, Said())
         elif "difference" not in table.columns and not any(map(_OF_LINK, table.names.values())):
             table.require("t", *["anchor"] * (files.anchors is not None), "range")
         table.seconds(format.time_unit)
@@ -96,4 +94,4 @@ def _readers(
     yield "odometry", lambda: read_odometry(str(files.odometry), format.of("odometry"), **how)
     columns = dict(format.of("imu").columns)
     yield "imu", lambda: read_inertial(str(files.imu), columns=columns, turn_unit=format.turn_unit)
-    yield "imu_frame", lambda: read_frame(files.imu_frame)
+    yield "imu_frame", lambda: read_frame(str(files.imu_frame))

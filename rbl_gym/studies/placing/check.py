@@ -135,9 +135,9 @@ def _through_walls(problem: Problem, drawn: DrawnBodies) -> list[dict[str, Any]]
     """
     tags = ranging.tag_positions(drawn.rotation, drawn.translation, problem.tags)
     seen = problem.obstacles.sees(drawn.translation[:, None], tags)[..., 0]
-    through = (np.logical_not(seen) | problem.obstacles.contain(tags)).any(axis=-1)
+    through = np.any(np.logical_not(seen) | problem.obstacles.contain(tags), axis=-1)
     return [
-        {"name": zone.name, "share": float(through[drawn.zone == k].mean())}
+        {"name": zone.name, "share": float(np.mean(through, where=drawn.zone == k))}
         for k, zone in enumerate(problem.zones)
         if (drawn.zone == k).any()
     ]
