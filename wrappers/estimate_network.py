@@ -37,12 +37,12 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Estimate orientations from bearings, and poses if lengths are observed; compute rewards.
 
     Wraps `RBL/PlanarNetwork-v0` and replaces its reward. For vector environments use
-    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements. The cycle iteration
-    (14) of the network paper corrects the edge angles; their sums along a tree are the
+    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements. The cycle iteration,
+    equation (14) of the network paper (N in docs/glossary.md), corrects the edge angles so that
+    those of each cycle sum to a multiple of 2 pi. Noise can change this multiple in long cycles, so
+    the estimate of the previous epoch selects it. Sums of the edge angles along a tree are the
     orientations. If lengths are observed, maximum likelihood starts from these orientations and
-    estimates orientations and positions. The edge angles of a cycle sum to a multiple of 2 pi. The
-    estimate of the previous epoch selects this multiple, because noise can change it in long
-    cycles.
+    estimates orientations and positions.
 
     Parameters
     ----------

@@ -36,8 +36,9 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         The environment.
     memory
         Whether the observation also has `known` (M,) and `age` (M,). `known` is the quality of each
-        anchor when it was chosen last: 1 in sight, 0 if it gave no range. `age` is the number of
-        steps since then. Before its first choice an anchor has `known` 0 and `age` 1e6.
+        anchor when it was chosen last: 1 in line of sight, the scene's `blocked_information` behind
+        an obstacle, 0 if it gave no range. `age` is the number of steps since then. Before its
+        first choice an anchor has `known` 0 and `age` 1e6.
 
     Info
     ----

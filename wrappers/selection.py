@@ -172,7 +172,8 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     * ``mode="top-k"``: ``Box(-1, 1, (12,))``, a score for each anchor; the `k` anchors with the
       highest scores are chosen.
     * ``mode="priced"``: ``MultiBinary(12)``, any number of anchors; each costs the `price`.
-    * ``mode="subset"``: ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order.
+    * ``mode="subset"``: ``Discrete(220)``, one of the subsets of `k` anchors, in lexicographic
+      order.
 
     In the last two modes `action_masks()` returns the actions that choose only existing anchors. If
     an action chooses an anchor that does not exist, this anchor is ignored.

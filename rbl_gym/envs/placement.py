@@ -145,14 +145,14 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     ## Description
     Every episode draws a problem: a work region, which is a box inside the scene's volume. In rooms
     it also draws up to two racks that block the line of sight, besides the scene's own obstacles.
-    The agent places M anchors on the scene's legal surfaces, where anchors may be mounted. The
+    The agent places M anchors in the scene's permitted region, where anchors may be mounted. The
     score of a layout is the root mean square error of the tag positions in metres. It depends on
     the errors of position and orientation. The Cramer-Rao bound predicts the score for 32 fixed
     poses in the region (`rbl_gym.placement.score`).
 
     ## Action space
-    * ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
-      surfaces (`Region.place`).
+    * ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the
+      permitted region (`Region.place`).
     * ``mode="one-shot"``: ``Box(-1, 1, (3 M,))``, all anchors at once.
     * ``mode="mounts"`` (rooms only): ``Discrete(57)``, one of the mount points of
       `rbl_gym.placement.mounts`. A mount that is already taken gets a second anchor.
@@ -168,9 +168,10 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     * ``"mounts"``: whether each mount is taken (57);
     * except in ``"one-shot"``: which anchor is next, one-hot (M).
 
-    If the legal space and the volume have the same centre, the environment mirrors every problem in
-    x and y so that the region lies towards +x and +y. So a policy need not learn mirror images
-    separately. Observations are mirrored, racks are sorted by x, and actions are mirrored back.
+    If the permitted region and the volume have the same centre in x and y, and the scene has no
+    obstacles of its own, the environment mirrors every problem in x and y so that the region lies
+    towards +x and +y. So a policy need not learn mirror images separately. Observations are
+    mirrored, racks are sorted by x, and actions are mirrored back.
     ``mirror=False`` turns this off.
 
     This is the observation with ``observation="flat"``. ``"dict"`` has positions in metres.
@@ -217,7 +218,7 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     * `racks`: number of racks in a room, 0 to 2.
     * `n_anchors`: number M of anchors to place; None for the default of
       `rbl_gym.placement.task`.
-    * `mirror`: whether the environment mirrors the problems of symmetric scenes.
+    * `mirror`: whether to mirror the problems of symmetric scenes, see the observation space.
     * `sight`: whether to observe what each mount sees; only with racks or obstacles.
     * `observation`: ``"flat"``, ``"dict"``, ``"tokens"``, ``"module:function"`` or a function, see
       the observation space.

@@ -56,7 +56,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     | `links` | (M, N) | int8 | 1 where a range was measured |
     | `anchors` | (M, 3) | float64 | positions of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
-    | `quality` | (M,) | float64 | fraction of the nominal information of an anchor's links: 1 in line of sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
+    | `quality` | (M,) | float64 | fraction of the Fisher information that the ranges of an anchor keep: 1 in line of sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
     | `inertial` | (S, 6) | float64 | S samples of the inertial sensor in that interval, body frame: angular velocity (rad/s) and specific force (m/s^2); zeros at epoch 0. Only in scenes with an inertial sensor |
 
     ## Reward

@@ -252,12 +252,12 @@ def described(one: PlacementTask) -> FloatArray:
 
     In this order:
 
-    * kind of the legal space, one-hot: box, walls, shell or other (4);
-    * half sizes of the volume and of the legal space, and the offset from the centre of the volume
-      to that of the legal space, divided by the scene's extent (9); the extent is half the diagonal
-      of the box around volume and anchors;
-    * decimal logarithms, divided by 4, of three quantities (3): the extent in metres; sigma over
-      radius; radius over extent. Here sigma is the noise of a range that is as long as the extent,
+    * kind of the permitted region, one-hot: box, walls, shell or other (4);
+    * half sizes of the volume and of the permitted region, and the offset from the centre of the
+      volume to that of the region, divided by the scene's extent (9); the extent is half the
+      diagonal of the box around volume and anchors;
+    * decimal logarithms, divided by 4, of three quantities (3): the extent in metres; sigma /
+      radius; radius / extent. Here sigma is the noise of a range that is as long as the extent,
       and radius is that of the body;
     * number of tags divided by 16 (1);
     * fraction of the information that a blocked link keeps (1).

@@ -73,7 +73,7 @@ class Scene:
     Parameters
     ----------
     name
-        Name in the registry, or the title of pictures.
+        Name of the scene, or its title in pictures and errors.
     volume
         Region in which the body moves.
     anchor_region, n_anchors, anchors
@@ -93,8 +93,8 @@ class Scene:
         Noise law of the ranges, and model of the links.
     obstacles, blocked_information
         Boxes (K, 6) that block the line of sight: centre and half size. A link is blocked if the
-        anchor does not see the body's origin. A blocked link has the fraction `blocked_information`
-        of its nominal information, that is, more noise. With 0 it gives no range.
+        anchor does not see the body's origin. A blocked link has more noise: it keeps the fraction
+        `blocked_information` of its Fisher information. With 0 it gives no range.
     prisms
         Obstacles that are polygons in plan between two heights, such as walls. They come from
         building files.
