@@ -9,10 +9,10 @@ from rbl_gym.bounds.twist import covariance_after
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
-from rbl_gym.estimators.iekf.vague_start import VAGUE_ROTATION_VARIANCE
 from rbl_gym.estimators.level import held
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.kernels.constants import VAGUE
 from rbl_gym.motion.kinematics import propagate
 
 
@@ -149,7 +149,7 @@ def track_augmented(
             )
         )
         moved, P = held(state, moved, level), moved.covariance
-        if not (P[..., 0, 0] + P[..., 1, 1] + P[..., 2, 2] <= VAGUE_ROTATION_VARIANCE).all():
+        if not (P[..., 0, 0] + P[..., 1, 1] + P[..., 2, 2] <= VAGUE).all():
             break
         epoch = ranges[..., e, :, :], weights[..., e, :, :], anchors[..., e, :, :], tags
         own = *moved[:2], moved.covariance[..., :6, :6]

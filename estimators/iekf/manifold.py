@@ -27,10 +27,15 @@ from rbl_gym.estimators.costs.losses import SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, map_problem
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.filter import PoseBelief
-from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, predict_pose, update_pose
+from rbl_gym.estimators.iekf.pose_steps import (
+    WEIGHTS,
+    as_state,
+    predict_pose,
+    update_pose,
+    update_pose_near,
+)
 from rbl_gym.estimators.iekf.robust_update import check_robust
 from rbl_gym.estimators.iekf.vague_start import (
-    VAGUE_ROTATION_VARIANCE,
     global_start,
     is_vague,
     net_of_starts,
@@ -188,29 +193,23 @@ class IteratedEkf:
     ) -> PoseState | None:
         """Return the update with a plain epoch, in few calls; None for other epochs.
 
-        Other epochs need the general code, which also raises the errors. `update_pose` checks the
-        values.
+        Other epochs and vague priors need the general code, which also raises the errors.
+        `update_pose_near` checks the values.
         """
+        if self.offset is not None:
+            return None
         (rotation, translation, P), tags = state, self.tags
         shares, numbers = links_of_plain_epoch(ranges, anchors, tags, P.shape[:-2]), self._numbers
-        if shares is None or self.offset is not None:
-            return None
-        if links is not None or noise is not None:
+        if shares is not None and (links is not None or noise is not None):
             shares, numbers = self._plain_law(ranges, links, noise)  # pyright: ignore[reportArgumentType]
-        if P.ndim == 2:
-            # The trace of the rotation block; single numbers are fastest as floats.
-            wide = P.item(0) + P.item(7) + P.item(14) > VAGUE_ROTATION_VARIANCE
-        else:
-            wide = is_vague(P).any()
-        if numbers is None or wide:
+        if shares is None or numbers is None:
             return None
         # Arguments one by one: unpacking them takes a tenth of the time of the call.
-        rotation, translation, P, cost = update_pose(
-            rotation, translation, P, ranges, shares, numbers, anchors, tags,
-            rotation, translation, self.options,
-        )  # fmt: skip
-        # One number suffices: it is finite if the covariance is.
-        if not all_finite(cost):
+        rotation, translation, P = update_pose_near(
+            rotation, translation, P, ranges, shares, numbers, anchors, tags, self.options
+        )
+        # One number of each trial suffices.
+        if not all_finite(P[..., 0, 0] if P.ndim > 2 else P[0, 0]):
             return None
         return PoseState(rotation, translation, P)
 

@@ -17,7 +17,7 @@ from rbl_gym.estimators.iekf.robust_update import late_solution, robust_solution
 from rbl_gym.estimators.inputs import plain
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
-from rbl_gym.kernels.constants import GATE, HUBER
+from rbl_gym.kernels.constants import GATE, HUBER, VAGUE
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.noise_laws import law_of
 
@@ -118,6 +118,28 @@ def update_pose(
     pose = kept_wide(prior, pose, (weights > 0).any(axis=-2), tags)
     known = np.isfinite(pose.covariance).all(axis=(-2, -1))
     return *pose, np.where(known, cost, np.nan)
+
+
+@compiled("pose_filter:update_near")
+def update_pose_near(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    ranges: FloatArray,
+    shares: FloatArray,
+    law: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    options: np.ndarray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return `update_pose` from the prior pose, without the cost.
+
+    The covariance is also NaN if the prior's rotation is vague (trace above `VAGUE`).
+    """
+    prior, epoch = (rotation, translation, covariance), (ranges, shares, law, anchors, tags)
+    rotation, translation, P, _ = update_pose.textbook(*prior, *epoch, *prior[:2], options)
+    firm = covariance[..., :3, :3].trace(axis1=-2, axis2=-1) <= VAGUE
+    return rotation, translation, np.where(firm[..., None, None], P, np.nan)
 
 
 def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> PoseState:

@@ -18,10 +18,7 @@ from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.estimators.locating.differences import places_of_differences
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
-
-# Above this standard deviation (rad) of the prior rotation, one linearisation is not sufficient.
-VAGUE_ROTATION_RAD = 0.5
-VAGUE_ROTATION_VARIANCE = VAGUE_ROTATION_RAD**2
+from rbl_gym.kernels.constants import VAGUE
 
 _NET = rotations.log(ROTATION_NET)
 
@@ -30,8 +27,8 @@ Starts = Callable[[MapProblem], tuple[FloatArray, FloatArray]]
 
 
 def is_vague(covariance: FloatArray) -> BoolArray:
-    """Return whether (...) the largest variance of the rotation exceeds `VAGUE_ROTATION_RAD`^2."""
-    limit = VAGUE_ROTATION_VARIANCE
+    """Return whether (...) the largest variance of the rotation exceeds `VAGUE`."""
+    limit = VAGUE
     # The trace bounds the largest eigenvalue, which suffices for most priors.
     if covariance.ndim == 2:
         trace = covariance.item(0, 0) + covariance.item(1, 1) + covariance.item(2, 2)
@@ -76,7 +73,7 @@ def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> Bo
 def _vague_directions(covariance: FloatArray) -> np.ndarray:
     """Return the number (...) of vague principal axes of the rotation."""
     values = np.linalg.eigvalsh(covariance[..., :3, :3])
-    return (values > VAGUE_ROTATION_VARIANCE).sum(axis=-1)
+    return (values > VAGUE).sum(axis=-1)
 
 
 def global_start(
@@ -119,7 +116,7 @@ def spread(prior: PoseState) -> FloatArray:
     """Return rotations (K, 24, 3, 3) around priors (K, 1), spread by the variance of each axis."""
     values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
     # The variance of a fixed axis may round to less than zero.
-    reach = np.minimum(np.sqrt(np.maximum(values, 0.0)) / VAGUE_ROTATION_RAD, 1.0)
+    reach = np.minimum(np.sqrt(np.maximum(values, 0.0) / VAGUE), 1.0)
     shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return rotations.exp((_NET @ shape)[:, 0]) @ prior.rotation
 

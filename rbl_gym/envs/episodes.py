@@ -14,22 +14,24 @@ from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes
 
-# Number of worlds drawn and built together, so that their random numbers do not fill the memory.
+# Number of worlds built together, so that their intermediate results do not fill the memory.
 _BLOCK = 1024
-# Number of worlds written together: their random numbers stay in the cache.
-_FEW = 32
+# Places in `simulation.Epoch` of the random numbers of the ranges.
+_DRAWN = tuple(map(simulation.Epoch._fields.index, ("normals", "uniforms")))
 
 
 class EpisodeStore:
-    """The running episodes of B worlds: arrays (T + 1, B, ...), epoch by epoch.
+    """The running episodes of B worlds, as arrays with axes (T + 1, B, ...).
 
-    A reset overwrites the arrays and does not allocate new ones, because fresh memory is slow.
+    The random numbers of the ranges stay where they were drawn, world by world; all other fields
+    are stored epoch by epoch. A reset overwrites the arrays and does not allocate new ones, because
+    fresh memory is slow.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
         self._scene = scene
         self._num_envs = num_envs
-        self._draws = simulation.empty_draws(scene, min(num_envs, _BLOCK))
+        self._draws = simulation.empty_draws(scene, num_envs)
         # The fields of `simulation.Epoch`; the first ones are views of the motion.
         self._timed: list[FloatArray | None] = []
         self._moved: list[FloatArray] = []
@@ -47,11 +49,11 @@ class EpisodeStore:
         Returns the fields of `simulation.Episode` without a time axis, of these worlds.
         """
         starts: list[Any] = []
+        simulation.draw_each(self._draws, worlds, generators)
         for first in range(0, len(worlds), _BLOCK):
             block = worlds[first : first + _BLOCK]
-            draws = simulation.Draws(*(field[: len(block)] for field in self._draws))
-            simulation.draw_each(draws, generators[first : first + len(block)])
             rows = rows_of(block)
+            draws = simulation.Draws(*(field[rows] for field in self._draws))
             episode = simulation.build_episode(self._scene, draws, self._motion_of(rows))
             self._write(block, simulation.whole(episode))
             starts.append(episode[len(simulation.Epoch._fields) :])
@@ -75,16 +77,17 @@ class EpisodeStore:
             epochs = len(self._moved[2])
             self._timed = [
                 *(held[-epochs:] for held in self._moved),
-                *(None if one is None else self._empty(one.shape[1:]) for one in fields[3:]),
+                *(
+                    None if drawn is None else np.swapaxes(drawn, 0, 1)
+                    for drawn in simulation.of_ranges(self._scene, self._draws)
+                ),
+                *(None if one is None else self._empty(one.shape[1:]) for one in fields[5:]),
             ]
+        rows = rows_of(worlds)
         for k, (stored, field) in enumerate(zip(self._timed, fields, strict=True)):
-            if stored is None or field is None:
-                continue
-            # The motion is in place already if the worlds are contiguous.
-            few = len(worlds) if k < len(simulation.Motion._fields) else _FEW
-            for first in range(0, len(worlds), few):
-                part = slice(first, first + few)
-                stored[:, rows_of(worlds[part])] = np.swapaxes(field[part], 0, 1)
+            # Random numbers are in place, and the motion is if the worlds are contiguous.
+            if k not in _DRAWN and stored is not None and field is not None:
+                stored[:, rows] = np.swapaxes(field, 0, 1)
 
     def _empty(self, shape: tuple[int, ...]) -> FloatArray:
         # Without the spare worlds, epochs of 1024 worlds would share lines of the cache.

@@ -14,3 +14,5 @@ LARGEST_SHARE_OUT = 0.5
 # Whitened residual above which a possibly late range is weighted less, and the remaining share of
 # its weight if it is late. Chosen on several public logs, whose errors hardly change from 0.8 to 1.
 LATE_HUBER, LATE_SHARE = 1.0, 0.5
+# Above this trace of the prior covariance of the rotation (rad^2), one linearisation may not do.
+VAGUE = 0.25

@@ -22,6 +22,7 @@ from rbl_gym.kernels.constants import (
     OF_LATE,
     POWER,
     THRESHOLD,
+    VAGUE,
 )
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
@@ -249,28 +250,12 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
     carry(T, information, 1.0, H)
 
 
-@gufunc(
-    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(o)->(d,d),(d),(p,p),()",
-    "ffffffffffiffff",
-)
-def update(
-    Q0,
-    t0,
-    P0,
-    ranges,
-    shares,
-    law,
-    anchors,
-    tags,
-    start_Q,
-    start_t,
-    options,
-    Q,
-    t,
-    P,
-    cost,
-):
-    """Compute the most likely pose of an epoch near a start, its covariance, and its cost.
+@helper
+def most_likely(
+    Q0: Any, t0: Any, P0: Any, ranges: Any, shares: Any, law: Any, anchors: Any, tags: Any,
+    start_Q: Any, start_t: Any, options: Any, Q: Any, t: Any, P: Any,
+) -> float:  # fmt: skip
+    """Compute the most likely pose of an epoch near a start, and its covariance; return its cost.
 
     `options` are the kind of the ranges' offsets, the number of iterations, and `robust`.
 
@@ -291,8 +276,7 @@ def update(
     if not (sound and invert(P0, L, information)):
         copy_pose(Q0, t0, Q, t)
         fill(math.nan, P)
-        cost[0] = math.nan
-        return
+        return math.nan
     if robust != SQUARES:
         loss[THRESHOLD] = HUBER
     if robust == LATE:
@@ -353,4 +337,29 @@ def update(
         if offset != 0:
             squared_residuals_of(Q, t, ranges, weights, anchors, tags, loss, offset, squared)
         total = of_prior + data_cost(squared, loss)
-    cost[0] = total
+    return total
+
+
+@gufunc(
+    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(o)->(d,d),(d),(p,p),()",
+    "ffffffffffiffff",
+)
+def update(
+    Q0, t0, P0, ranges, shares, law, anchors, tags, start_Q, start_t, options, Q, t, P, cost
+):  # fmt: skip
+    """Compute the most likely pose of an epoch near a start, its covariance, and its cost."""
+    cost[0] = most_likely(
+        Q0, t0, P0, ranges, shares, law, anchors, tags, start_Q, start_t, options, Q, t, P
+    )
+
+
+@gufunc(
+    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(o)->(d,d),(d),(p,p)",
+    "ffffffffifff",
+)
+def update_near(Q0, t0, P0, ranges, shares, law, anchors, tags, options, Q, t, P):
+    """Compute `update` from the prior pose; NaN if the prior is vague about the rotation."""
+    copy_pose(Q0, t0, Q, t)
+    fill(math.nan, P)
+    if P0[0, 0] + P0[1, 1] + P0[2, 2] <= VAGUE:
+        most_likely(Q0, t0, P0, ranges, shares, law, anchors, tags, Q0, t0, options, Q, t, P)

@@ -12,11 +12,10 @@ import numpy as np
 
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.augmented_filter import move, revise
+from rbl_gym.kernels.constants import VAGUE
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.workspace import workspace
 
-# Above this variance of the rotation (rad^2), an update may need a search for its start.
-_VAGUE = 0.25
 # Larger than any variance.
 _HUGE = 1e300
 
@@ -110,7 +109,7 @@ def track(
         )  # fmt: skip
         if held:
             hold(old_P, level, Q0[e], t0[e], extra0[e], P0[e])
-        if not P0[e, 0, 0] + P0[e, 1, 1] + P0[e, 2, 2] <= _VAGUE:
+        if not P0[e, 0, 0] + P0[e, 1, 1] + P0[e, 2, 2] <= VAGUE:
             return
         for i in range(6):
             for j in range(6):

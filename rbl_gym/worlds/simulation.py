@@ -123,11 +123,11 @@ def empty_draws(scene: Scene, count: int) -> Draws:
     )
 
 
-def draw_each(draws: Draws, generators: Iterable[np.random.Generator]) -> None:
-    """Apply `draw` to every row with a generator of its own, for vector environments."""
-    for normals, uniforms, generator in zip(*draws, generators, strict=True):
-        generator.standard_normal(out=normals)
-        generator.random(out=uniforms)
+def draw_each(draws: Draws, worlds: np.ndarray, generators: Iterable[np.random.Generator]) -> None:
+    """Apply `draw` to these rows, each with a generator of its own, for vector environments."""
+    for world, generator in zip(worlds.tolist(), generators, strict=True):
+        generator.standard_normal(out=draws.normals[world])
+        generator.random(out=draws.uniforms[world])
 
 
 def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
