@@ -20,7 +20,7 @@ from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import building, criteria, scene_files
 from rbl_gym.placement.file_keys import FORMAT, MATERIALS
 from rbl_gym.placement.file_schema import schema
-from rbl_gym.placement.file_walls import wall_pieces
+from rbl_gym.placement.wall_lines import wall_pieces
 from tests.helpers import ROOT, changed_tables, needs
 
 OFFICE = tomllib.loads((ROOT / "examples" / "office.toml").read_text(encoding="utf-8"))
@@ -64,10 +64,14 @@ def test_the_office_is_read():
     assert (second.share, second.heading_deg) == (0.9, None)
     assert first.has_requirement
     assert {zone.attitude for zone in problem.zones} <= set(building.ATTITUDES)
-    # Six pieces of outer wall, two of drywall, the core and the cupboard.
-    assert len(problem.obstacles.prisms) == len(problem.obstacles) == 10
+    # Six pieces of outer wall, three of drywall, the lift shaft and the cupboard.
+    assert len(problem.obstacles.prisms) == len(problem.obstacles) == 11
     share = problem.obstacles.prisms.share
-    np.testing.assert_array_equal(share[~np.isnan(share)], [0.05, 0.6, 0.6])
+    np.testing.assert_array_equal(share[~np.isnan(share)], [0.05, 0.6, 0.6, 0.6])
+    assert len(problem.obstacle_names) == 11
+    assert problem.obstacle_names[:3] == (
+        "lift shaft (15, 4 to 18, 7)", "cupboard (2, 4 to 6, 4.6)", "wall 1 (0, 0 to 24, 0)",
+    )  # fmt: skip
 
 
 @needs("shapely")
@@ -132,6 +136,54 @@ def test_walls_are_mitred_where_they_meet():
     # A hairpin is not drawn out to a needle.
     needle = wall_pieces(np.array([[0.0, 0], [4, 0], [0, 0.1]]), 0.1, closed=False)
     assert np.abs(np.concatenate(needle)).max() < 4.5
+
+
+def test_openings_leave_the_wall_beside_above_and_below_them():
+    wall = {"line": [[5, 0], [5, 8]], "thickness_m": 0.2, "high_m": 3, "information": 0.5}
+    door = {"line": [[5.05, 4], [5, 3]]}
+    window = {"line": [[5, 6], [5, 7]], "low_m": 1, "high_m": 2}
+    problem = scene_files.of_mapping(HALL | {"walls": [wall], "openings": [door, window]})
+    for y, z, wanted in (
+        (2.5, 1.0, 0.5), (3.5, 1.0, 1.0), (3.5, 2.5, 0.5), (3.5, 2.0, 1.0), (5.0, 1.5, 0.5),
+        (6.5, 0.5, 0.5), (6.5, 1.5, 1.0), (6.5, 2.5, 0.5), (7.5, 1.5, 0.5),
+    ):  # fmt: skip
+        share = problem.obstacles.share(np.array([[4.0, y, z]]), np.array([[6.0, y, z]]))
+        assert share[0, 0] == wanted, (y, z)
+    prisms = problem.obstacles.prisms
+    heights = prisms.high_m - prisms.low_m
+    volume = sum(polygons.area(ring) * h for ring, h in zip(prisms.corners, heights, strict=True))
+    assert volume == pytest.approx(0.2 * (8 * 3 - 1 * 2.1 - 1 * 1))
+    assert set(problem.obstacle_names) == {"wall 1 (5, 0 to 5, 8)"}
+
+
+def test_an_opening_at_a_corner_leaves_simple_pieces():
+    ring = {"line": SQUARE, "closed": True, "thickness_m": 0.4, "high_m": 3}
+    # Over two walls of the corner (4, 0), and one over the whole height.
+    openings = [{"line": [[3, 0], [4, 0], [4, 1]]}, {"line": [[1, 4], [2, 4]], "high_m": 9}]
+    zone = {"low": [1, 1, 0], "high": [3, 3, 1]}
+    tables = HALL | {"walls": [ring], "openings": openings, "zones": [zone]}
+    prisms = scene_files.of_mapping(tables).obstacles.prisms
+    for corners in prisms.corners:
+        polygons.check_polygon("piece", corners[np.append(True, np.diff(corners, axis=0).any(1))])
+    heights = prisms.high_m - prisms.low_m
+    volume = sum(polygons.area(ring) * h for ring, h in zip(prisms.corners, heights, strict=True))
+    # On the inside the last 0.2 m of each opening are part of the corner.
+    door = 2 * 0.4 * 0.5 * (1 + 0.8)
+    assert volume == pytest.approx((4.4**2 - 3.6**2) * 3 - 1 * 0.4 * 3 - door * 2.1)
+
+
+@needs("shapely")
+def test_no_anchor_is_mounted_in_an_opening():
+    wall = {"line": [[0, 8], [10, 8]], "thickness_m": 0.2, "high_m": 3}
+    mount = {"kind": "wall", "line": [[0, 8], [10, 8]], "side": "both", "low_m": 1, "high_m": 2.5}
+    tables = HALL | {"anchors": {"number": 4}, "walls": [wall], "mounts": [mount]}
+    tables["openings"] = [{"line": [[4, 8], [6, 8]]}]
+    problem = scene_files.of_mapping(tables)
+    x, _, z = anywhere(problem).T
+    assert not ((x > 4.001) & (x < 5.999) & (z < 2.099)).any()
+    assert ((x > 4) & (x < 6) & (z > 2.1)).any()
+    assert isinstance(problem.mounts, Mounts)
+    assert problem.mounts.measure.sum() == pytest.approx(2 * (10 * 1.5 - 2 * 1.1), abs=0.01)
 
 
 def test_losses_by_material_multiply_and_opaque_ones_count_once():
@@ -372,6 +424,10 @@ BAD = [
     ("obstacles.0.low", [1, 1, 1], "obstacles[0] has an unknown key 'low'; it may have polygon"),
     ("obstacles.0.high_m", 0, "obstacles[0]: low_m must lie below high_m, got 0 and 0"),
     ("obstacles.1.low", None, "obstacles[1] must have the key 'low'"),
+    ("openings.0.line", [[5, 12], [6, 12]], "openings[0] must lie in one of [[walls]], along its"),
+    ("openings.0.line", [[5, 10], [5, 11]], "openings[0] must lie in one of [[walls]], along its"),
+    ("openings.0.low_m", 5, "openings[0]: low_m must lie below high_m, got 5 and 2.1"),
+    ("openings.0.width_m", 1, "openings[0] has an unknown key 'width_m'; it may have line, low_m"),
     ("slabs", [{"polygon": SQUARE, "z_m": 3, "material": "x"}], "slabs[0].material must be one"),
     ("mounts.0.kind", "roof", "mounts[0].kind must be one of 'wall', 'ceiling', 'column'"),
     ("mounts.0.kind", None, "mounts[0] must have the key 'kind'"),
@@ -494,9 +550,9 @@ def test_the_schema_refuses_what_the_reader_refuses_by_form():
     rule = schema()
     # What only geometry or other tables can tell.
     deeper = re.compile("cross or touch|different points|one of .materials|either material|lie "
-                        "below|inside an obst|of anchors.fixed|from|free place|must differ|needs|"
-                        "no effect|at most|finite, got|1e\\+06 m|permitted|not be empty|"
-                        "axis|either .region|slabs|must be given")  # fmt: skip
+                        "in one|lie below|inside an obst|of anchors.fixed|from|free place|must "
+                        "differ|needs|no effect|at most|finite, got|1e\\+06 m|permitted|not be "
+                        "empty|axis|either .region|slabs|must be given")  # fmt: skip
     checked = 0
     for path, value, message in BAD:
         if deeper.search(message) or value is NAN:

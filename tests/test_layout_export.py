@@ -70,7 +70,7 @@ ROOMS: dict[str, Any] = {
         {"line": [[4, 5], [4, 6]], "high_m": 3.0, "thickness_m": 0.2},
         {"line": [[7, 0], [7, 3]], "high_m": 1.2},
     ],
-    "obstacles": [{"low": [8, 4, 0], "high": [8.5, 4.5, 3.0]}],
+    "obstacles": [{"name": "pillar", "low": [8, 4, 0], "high": [8.5, 4.5, 3.0]}],
     "mounts": [
         {"kind": "ceiling", "polygon": [[0, 0], [10, 0], [10, 6], [0, 6]], "height_m": 2.9},
         {"kind": "wall", "line": [[4, 0], [4, 4]], "side": "both", "low_m": 2.0, "high_m": 2.8},
@@ -88,15 +88,26 @@ ROOMS: dict[str, Any] = {
     [
         # Under the ceiling of the second room: its own walls, not those of the first; over the low
         # wall; but not behind the pillar.
-        ([5.0, 2.0, 2.9], [("-x", "wall", 0.9, 4.1, 2.0), ("-y", "wall", 1.9, 5.0, 0.1)]),
-        ([8.2, 5.0, 2.9], [("-y", "wall", 0.5, 8.2, 4.5), ("+x", "wall", 1.7, 9.9, 5.0)]),
+        ([5.0, 2.0, 2.9], [("-x", "wall 2 (4, 0 to 4, 4)", 0.9, 4.1, 2.0),
+                           ("-y", "wall 1 (0, 0 to 10, 0)", 1.9, 5.0, 0.1)]),
+        ([8.2, 5.0, 2.9], [("-y", "pillar (8, 4 to 8.5, 4.5)", 0.5, 8.2, 4.5),
+                           ("+x", "wall 1 (10, 0 to 10, 6)", 1.7, 9.9, 5.0)]),
         # Under the ceiling, at the face of the outer wall, which is 0.2 m thick.
-        ([6.0, 5.9, 2.9], [("+y", "wall", 0.0, 6.0, 5.9), ("-x", "wall", 1.9, 4.1, 5.9)]),
+        ([6.0, 5.9, 2.9], [("+y", "wall 1 (10, 6 to 0, 6)", 0.0, 6.0, 5.9),
+                           ("-x", "wall 3 (4, 5 to 4, 6)", 1.9, 4.1, 5.9)]),
         # On the inner wall from the first room: the corner to the left, the door to the right.
         ([3.9, 1.0, 2.5], [("left", "end of the wall", 3.0, 3.9, 4.0),
-                           ("right", "wall", 0.9, 3.9, 0.1)]),
+                           ("right", "wall 1 (0, 0 to 10, 0)", 0.9, 3.9, 0.1)]),
+        # Near the corner, in it, and at the other end.
+        ([3.9, 0.13, 2.5], [("left", "end of the wall", 3.87, 3.9, 4.0),
+                            ("right", "wall 1 (0, 0 to 10, 0)", 0.03, 3.9, 0.1)]),
+        ([3.9, 0.1, 2.5], [("left", "end of the wall", 3.9, 3.9, 4.0),
+                           ("right", "wall 1 (0, 0 to 10, 0)", 0.0, 3.9, 0.1)]),
+        ([3.9, 4.0, 2.5], [("left", "end of the wall", 0.0, 3.9, 4.0),
+                           ("right", "wall 1 (0, 0 to 10, 0)", 3.9, 3.9, 0.1)]),
         # On the outer wall of the second room: up to the inner wall.
-        ([5.0, 5.9, 2.5], [("left", "wall", 0.9, 4.1, 5.9), ("right", "wall", 4.9, 9.9, 5.9)]),
+        ([5.0, 5.9, 2.5], [("left", "wall 3 (4, 5 to 4, 6)", 0.9, 4.1, 5.9),
+                           ("right", "wall 1 (10, 0 to 10, 6)", 4.9, 9.9, 5.9)]),
     ],
 )  # fmt: skip
 def test_distances_are_to_walls_that_are_seen_from_the_anchor(anchor, found):
@@ -118,14 +129,28 @@ def test_a_ceiling_without_walls_is_measured_from_its_edges():
     assert found == [("-y", "edge of the mount", 2.0), ("-x", "edge of the mount", 5.0)]
 
 
-def test_csv_is_a_layout_that_place_reads(problem, tmp_path):
+def test_above_a_door_the_wall_goes_on():
+    tables: dict[str, Any] = ROOMS | {"openings": [{"line": [[4, 2], [4, 3]]}]}
+    rooms = scene_files.of_mapping(tables)
+    place = np.array([3.9, 1.0, 2.5])
+    measured = measured_from(rooms, place, rooms.mounts.normal(place))
+    assert [one["distance_m"] for one in measured] == [3.0, 0.9]
+
+
+def test_csv_is_a_layout_that_place_and_replay_read(problem, tmp_path):
     from rbl_gym.placement.layout_files import read_layout
+    from rbl_gym.recordings.points import read_points
+    from rbl_gym.recordings.report import Said
+    from rbl_gym.recordings.tables import Source
 
     path = tmp_path / "new" / "l.csv"
     write_layout(problem, ANCHORS, str(path), ["N", "E", "S", "W"])
     found = read_layout(str(path))
     np.testing.assert_allclose(found.positions, ANCHORS)
     assert list(found.names) == ["N", "E", "S", "W"]
+    anchors = read_points(str(path), "anchor", Source(file="anchors"), Said())
+    assert anchors.ids == found.names
+    np.testing.assert_array_equal(anchors.places, found.positions)
     with path.open(encoding="utf-8") as file:
         row = next(csv.DictReader(file))
     assert row["faces"] == "+y"

@@ -20,6 +20,8 @@ def read(tmp_path, text, encoding="utf-8"):
         "x_m,y_m,z_m,name\n1,2,3,a\n-4.5,0,1e1,b c\n",
         "name; z_m; note; Y_M; x_m\r\na;3;;2;1\r\n\r\n b c;10;;0;-4.5\r\n",
         '\ufeffname,x_m,y_m,z_m\na,1,2,3\n"b c",-4.5,0,10',
+        "anchor,x,y,z\na,1,2,3\nb c,-4.5,0,10\n",
+        "X,y,z_m,id\n1,2,3,a\n-4.5,0,10,b c\n",
     ],
 )
 def test_columns_are_found_by_their_names(tmp_path, text):
@@ -37,7 +39,8 @@ def test_anchors_without_names_are_counted(tmp_path):
     ("text", "message"),
     [
         ("", "first line must name the columns"),
-        ("x,y,z\n1,2,3\n", "x_m, y_m, z_m not found in 'x,y,z'"),
+        ("x,y\n1,2\n", "(or x, y, z) and optionally name; z_m not found in 'x,y'"),
+        ("x,y,z\n1,2,high\n", "line 2, column z: must be a number, got 'high'"),
         ("x_m,y_m,z_m\n", "must have at least one anchor"),
         ("x_m,y_m,z_m\n1,2,3\n1,2\n", "line 3: must have 3 cells like the header, got 2"),
         ("x_m,y_m,z_m\n1,2,high\n", "line 2, column z_m: must be a number, got 'high'"),

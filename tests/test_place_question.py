@@ -354,10 +354,20 @@ def test_the_cheapest_of_the_least_number_is_taken():
 
 
 def test_what_cannot_be_met_is_said():
-    problem = room(position_m=0.001)
-    found = choosing.fewest_anchors(problem, range(3, 9), 0)
+    found = choosing.fewest_anchors(room(), range(3, 4), 0)
     assert not found.met
-    assert len(found.anchors) == 8
+    assert len(found.anchors) == 3
+    # Not even with an anchor at every bracket: no search begins.
+    problem, told = room(position_m=0.001), Told()
+    with pytest.raises(ValueError, match="no number of anchors meets the requirements") as error:
+        choosing.fewest_anchors(problem, range(3, 9), 0, 0, told)
+    assert told.announced == 0
+    for judged in judging.judge(problem, mounts(*range(10)), 0, most=judging.PLACES):
+        factor = judging.would_pass(judged)["factor"]
+        assert (
+            f"zone {judged.zone.name!r} would pass only with limits {factor:.3g} times as large "
+            "(position_m = 0.001 decides)"
+        ) in str(error.value)
     with pytest.raises(ValueError, match="fewest needs a requirement"):
         choosing.fewest_anchors(scene_files.problem("uwb_room"), range(3, 9), 0)
 

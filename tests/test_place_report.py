@@ -101,13 +101,14 @@ def test_plan_writes_a_file_that_place_reads(tmp_path, capsys):
     plan, out = write_geojson(tmp_path / "office.geojson"), tmp_path / "new" / "office.toml"
     picture = tmp_path / "plan.png"
     command = ["plan", plan, "-o", str(out), "--anchors", "6", "--plot", str(picture)]
-    assert main(command) == 0
+    assert main([*command, "--zones", "zone,attitude=level,height_m=0.3"]) == 0
     shown = capsys.readouterr().out
     assert "layers of the drawing" in shown
     assert f"building: {out}" in shown
     assert picture.stat().st_size > 20_000
     problem = scene_files.problem(str(out))
     assert (problem.name, problem.n_anchors, len(problem.zones)) == ("office", 6, 2)
+    assert {(zone.attitude, zone.height_m) for zone in problem.zones} == {("level", 0.3)}
     assert problem.plan is not None
     assert str(problem.plan.drawing).endswith("office.geojson")
     assert "rbl-gym plan" in out.read_text().splitlines()[0]
@@ -136,6 +137,8 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
         (["plan", "nowhere.geojson"], "nowhere.geojson: No such file or directory"),
         (["plan", "x.dwg"], "x.dwg: DWG files cannot be read: save the drawing as DXF"),
         (["plan", "x.png", "--walls", "A"], "a picture has no layers: leave out --walls"),
+        (["plan", "x.geojson", "--zones", "A,attitude=up"], "attitude must be one of free, level"),
+        (["plan", "x.geojson", "--mounts", "A,kind=roof"], "--mounts A: kind must be one of wall"),
         (["plan", "x.geojson", "--walls", "A,x=1"], "unknown key 'x'; the keys are material"),
         (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),
         (["place", "--scene", "uwb_room", "--walls", "A"], "--walls needs a drawing"),
@@ -189,22 +192,48 @@ def test_the_report_is_the_same_for_the_same_result(placed, tmp_path, monkeypatc
     assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
 
 
+OVER = {
+    "anchors": {"number": 4},
+    "mounts": [{"kind": "ceiling", "polygon": [[0, 0], [10, 0], [10, 8], [0, 8]],
+                "height_m": 2.6}],
+    "slabs": [{"polygon": [[0, 0], [10, 0], [10, 8], [0, 8]], "z_m": 2.6}],
+    "obstacles": [{"low": [4, 4.1, 0], "high": [6, 5, 0.5]}],
+    "zones": [{"name": "ground", "polygon": [[1, 1], [9, 1], [9, 7], [1, 7]], "low_m": 0.2,
+               "high_m": 1.0}],
+    "body": {"shape": "octahedron", "size_m": 0.8},
+    "noise": {"floor_m": 0.1},
+}  # fmt: skip
+
+
 def test_floors_do_not_hide_the_zones_in_a_plan():
-    zone = {"polygon": [[1, 1], [9, 1], [9, 7], [1, 7]], "low_m": 0.2, "high_m": 1.0}
-    tables = {
-        "anchors": {"number": 4},
-        "mounts": [{"kind": "ceiling", "polygon": [[0, 0], [10, 0], [10, 8], [0, 8]],
-                    "height_m": 2.6}],
-        "slabs": [{"polygon": [[0, 0], [10, 0], [10, 8], [0, 8]], "z_m": 2.6}],
-        "obstacles": [{"low": [4, 4, 0], "high": [6, 5, 0.5]}],
-        "zones": [zone],
-        "body": {"shape": "octahedron", "size_m": 0.8},
-        "noise": {"floor_m": 0.1},
-    }  # fmt: skip
-    problem = scene_files.of_mapping(tables)
+    problem = scene_files.of_mapping(OVER)
     assert len(shapes.solids(problem)) == 2
     (table,) = shapes.solids_in_plan(problem)
     assert (table.low_m, table.high_m) == (0.0, 0.5)
+
+
+def test_the_wall_above_a_door_is_drawn_as_overhead(placed):
+    tables = json.loads(json.dumps(OVER))
+    tables["walls"] = [{"line": [[0, 4], [10, 4]], "high_m": 2.6}]
+    tables["openings"] = [{"line": [[3, 4], [4, 4]]}, {"line": [[7, 4], [8, 4]], "low_m": 1}]
+    problem = scene_files.of_mapping(tables)
+    over = [s for s in shapes.solids_in_plan(problem) if shapes.is_overhead(problem, s)]
+    ends = sorted(solid.corners[:, 0].tolist() for solid in over)
+    assert [(min(x), max(x)) for x in ends] == [(3, 4), (7, 8)]
+    assert {(solid.low_m, solid.high_m) for solid in over} == {(2.1, 2.6)}
+    assert "dotted: overhead" in place_figures.legend_text(problem)
+    assert "dotted" not in place_figures.legend_text(placed.problem)
+
+
+def test_of_zones_above_each_other_the_label_names_those_that_the_map_hides():
+    tables = json.loads(json.dumps(OVER))
+    yard = {"name": "yard", "low": [11, 1, 0], "high": [14, 7, 2]}
+    tables["zones"] += [OVER["zones"][0] | {"name": "first", "low_m": 3, "high_m": 4}, yard]
+    problem = scene_files.of_mapping(tables)
+    labels = shapes.zone_labels(problem, np.empty((0, 3)))
+    assert [text for text, _ in labels] == [
+        "first, z 3 to 4 m\nnot shown: ground, z 0.2 to 1 m", "yard",
+    ]  # fmt: skip
 
 
 def test_a_label_has_a_line_to_its_marker_if_it_is_far_or_another_marker_is_near():

@@ -35,12 +35,17 @@ def draw_building(axes: Any, problem: Problem, anchors: FloatArray, names: bool 
     axes.tick_params(length=2, labelsize=7)
     _draw_backdrop(axes, problem)
     found = shapes.solids_in_plan(problem)
+    over = [shapes.is_overhead(problem, solid) for solid in found]
     axes.add_collection(
         PolyCollection(
             [solid.corners for solid in found],
-            facecolors=[shapes.grey(solid.share) for solid in found],
+            facecolors=[
+                "none" if above else shapes.grey(solid.share)
+                for solid, above in zip(found, over, strict=True)
+            ],
             edgecolors="0.2",
             linewidths=0.5,
+            linestyles=[":" if above else "-" for above in over],
             zorder=3,
         ),
         autolim=False,
@@ -61,9 +66,9 @@ def draw_building(axes: Any, problem: Problem, anchors: FloatArray, names: bool 
             shapes.sides_of(zone.polygon), colors=ZONE, lw=1.1, ls=(0, (4, 2)), zorder=4
         )
         axes.add_collection(sides, autolim=False)
-        if names and len(problem.zones) > 1:
-            at = shapes.inner_point(zone.polygon, found, anchors)
-            axes.text(*at, zone.name, fontsize=8, ha="center", va="center", zorder=6, bbox=_WHITE)
+    if names and len(problem.zones) > 1:
+        for text, at in shapes.zone_labels(problem, anchors):
+            axes.text(*at, text, fontsize=8, ha="center", va="center", zorder=6, bbox=_WHITE)
 
 
 def _draw_backdrop(axes: Any, problem: Problem) -> None:

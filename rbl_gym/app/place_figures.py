@@ -134,6 +134,8 @@ def legend_text(problem: Problem) -> str:
     parts += ["dashed: zones", "violet: where anchors may be mounted"]
     if problem.obstacles:
         parts.append("grey: obstacles, darker if they weaken links more")
+    if any(shapes.is_overhead(problem, solid) for solid in shapes.solids_in_plan(problem)):
+        parts.append("dotted: overhead, such as walls above doors")
     return "     ".join(parts)
 
 

@@ -81,7 +81,9 @@ def mounting_rows(placed: Placed) -> list[list[str]]:
 
 def measured_text(one: dict[str, Any]) -> str:
     """Return a distance to a wall in words."""
-    where = f"{one['to']} at ({one['x_m']:g}, {one['y_m']:g})"
+    where = one["to"]
+    if not where.endswith(")"):  # its name has no position
+        where += f" at ({one['x_m']:g}, {one['y_m']:g})"
     if one["side"] in ("left", "right"):
         return f"{one['distance_m']:.2f} m to the {one['side']}: {where}"
     return f"{one['distance_m']:.2f} m towards {one['side']}: {where}"

@@ -18,6 +18,7 @@ from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.placing.accuracy import Map, accuracy_map
 from rbl_gym.studies.placing.answer import Placed
 from rbl_gym.studies.placing.judging import limits_of
+from rbl_gym.studies.placing.tape import floor_below
 
 # Blue and vermilion of Okabe and Ito, distinguishable by everyone, and in grey.
 WITHIN, BEYOND, NOTHING = "#56b4e9", "#d55e00", "#c9ced2"
@@ -29,6 +30,8 @@ _LEAST_CONTRAST = 1.15
 _MOST_OF_LIMIT = 3.0
 # An obstacle over a whole zone is a floor if it is at most this thick, metres.
 _FLOOR_M = 0.6
+# An obstacle that begins this far above the floor is overhead, metres.
+_HEAD_M = 1.8
 # A hole of a zone is joined to its outline by a slit of this width, metres.
 _SLIT_M = 0.003
 
@@ -106,6 +109,12 @@ def solids_in_plan(problem: Problem) -> list[Solid]:
     ]
 
 
+def is_overhead(problem: Problem, solid: Solid) -> bool:
+    """Return whether one can walk below an obstacle, such as the wall above a door."""
+    middle = np.array([*solid.corners.mean(axis=0), solid.low_m])
+    return solid.low_m - floor_below(problem, middle) >= _HEAD_M
+
+
 def grey(share: float) -> str:
     """Return a grey level, darker for smaller information fractions."""
     return f"{0.32 + 0.36 * min(max(share, 0.0), 1.0):.2f}"
@@ -152,6 +161,30 @@ def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) 
         off = (inside - anchor) * (0.5, 1.0)
         clear = np.minimum(clear, np.linalg.norm(off, axis=-1))
     return inside[(clear / max(clear.max(), 1e-9) - away).argmax()]
+
+
+def zone_labels(problem: Problem, anchors: FloatArray) -> list[tuple[str, FloatArray]]:
+    """Return labels of the zones and where to write them, (2,).
+
+    Maps show the last one of zones that are one above the other. Its label names the others, too.
+    """
+    zones, blocked = problem.zones, solids_in_plan(problem)
+    spots = [inner_point(zone.polygon, blocked, anchors) for zone in zones]
+    hidden: dict[int, list[int]] = {k: [] for k in range(len(zones))}
+    for k, spot in enumerate(spots):
+        over = [j for j in hidden if j > k and contains(zones[j].polygon, spot[None])[0]]
+        if over:
+            hidden[over[-1]] += [k, *hidden.pop(k)]
+    heights = [f"{zone.name}, z {zone.low_m:g} to {zone.high_m:g} m" for zone in zones]
+    return [
+        (
+            f"{heights[k]}\nnot shown: {'; '.join(heights[j] for j in others)}"
+            if others
+            else zones[k].name,
+            spots[k],
+        )
+        for k, others in hidden.items()
+    ]
 
 
 def _to_edge(points: FloatArray, ring: FloatArray) -> FloatArray:

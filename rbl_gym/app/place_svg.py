@@ -160,6 +160,8 @@ def _building(draw: _Drawing, placed: Placed) -> str:
     for solid in shapes.solids_in_plan(problem):
         level = round(255 * float(shapes.grey(solid.share)))
         style = f'fill="rgb({level},{level},{level})" stroke="#333" stroke-width="0.6"'
+        if shapes.is_overhead(problem, solid):
+            style = 'fill="none" stroke="#333" stroke-width="0.6" stroke-dasharray="1 2"'
         parts.append(draw.polygon(solid.corners, style))
     if not shapes.is_far(problem, anchors):
         lines, _ = shapes.mount_shapes(problem)
@@ -173,7 +175,7 @@ def _building(draw: _Drawing, placed: Placed) -> str:
 def _labels(placed: Placed, edges: FloatArray) -> str:
     """Return names of zones and markers of anchors, elements of fixed size over the SVG."""
     problem, anchors = placed.problem, placed.design.anchors
-    parts, solids = [], shapes.solids_in_plan(problem)
+    parts = []
     for name, anchor, row in zip(
         anchor_names(placed), anchors, placed.result["anchors"], strict=True
     ):
@@ -193,11 +195,11 @@ def _labels(placed: Placed, edges: FloatArray) -> str:
             f'title="{html.escape(told)}">{html.escape(name)}{away if outside else ""}</span>'
         )
     if len(problem.zones) > 1:
-        for zone in problem.zones:
-            x, y = _share(shapes.inner_point(zone.polygon, solids, anchors), edges)
+        for text, at in shapes.zone_labels(problem, anchors):
+            x, y = _share(at, edges)
             parts.append(
                 f'<span class="label zone" data-x="{x:.5f}" data-y="{y:.5f}">'
-                f"{html.escape(zone.name)}</span>"
+                f"{'<br>'.join(map(html.escape, text.splitlines()))}</span>"
             )
     return "".join(parts)
 

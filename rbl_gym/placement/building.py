@@ -138,6 +138,8 @@ class Problem(PlacementTask):
         The drawing of the building, or None.
     notes
         Doubtful parts of the file, in words.
+    obstacle_names
+        Names of the obstacles with their positions in the plan, boxes first; empty if unknown.
     """
 
     n_poses: int = 64
@@ -145,6 +147,7 @@ class Problem(PlacementTask):
     fixed: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     plan: Plan | None = None
     notes: tuple[str, ...] = ()
+    obstacle_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check nothing: `file_checks` does, and a drawing may show any scene."""

@@ -89,13 +89,16 @@ _LINE = Key("line", "points [[x, y], ...] in the plan, metres", **_NEEDED)
 _CLOSED = Key("flag", "whether the last point is joined to the first", default=False)
 _LOW = _metres("lower height, metres", default=0.0)
 _HIGH = _metres("upper height, metres", **_NEEDED)
+_LINTEL = _metres("upper height, metres", default=2.1)
 _FROM = _metres("lower height, metres", **_NEEDED)
 _BOX = {
     "low": Key("place", "lower corner [x, y, z], metres", **_NEEDED),
     "high": Key("place", "upper corner [x, y, z], metres", **_NEEDED),
 }
 _SHARE: dict[str, Any] = {"low": 0.0, "high": 1.0}
+_NAME = Key("text", "name in the results")
 _LOSS = {
+    "name": _NAME,
     "material": Key(
         "text", "one of [materials] or a standard material; opaque without material and information"
     ),
@@ -103,7 +106,6 @@ _LOSS = {
         "number", "share of the information that remains, in place of material", **_SHARE
     ),
 }
-_NAME = Key("text", "name in the results")
 _REACH = {
     "max_range_m": _size("a longer link has no information, metres; default: no limit"),
     "range_edge_m": _metres(
@@ -300,6 +302,11 @@ FORMAT: dict[str, Table] = {
                 }
             ),
         ),
+        many=True,
+    ),
+    "openings": Table(
+        "openings in walls: doors, windows, gates",
+        (Form({"line": _LINE, "low_m": _LOW, "high_m": _LINTEL}),),
         many=True,
     ),
     "obstacles": Table(

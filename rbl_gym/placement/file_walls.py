@@ -1,4 +1,4 @@
-"""Obstacles and mounts of a building from the tables of a file: walls, obstacles, slabs."""
+"""Obstacles and mounts of a building from the tables of a file: walls, openings, slabs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, did_you_mean
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
-from rbl_gym.geometry.polygons import TOUCH_M, check_polygon, rectangle
+from rbl_gym.geometry.polygons import check_polygon, rectangle
 from rbl_gym.placement.file_keys import MATERIALS
 from rbl_gym.placement.mounting import Mount
+from rbl_gym.placement.wall_lines import Opening, Wall, opened, segments, turned, wall_pieces
 
-# Mitres longer than this many half thicknesses are cut off.
-_LONGEST_MITRE = 4.0
 # A mount is parallel to a wall if their directions differ by less than this, radians.
 _PARALLEL = 1e-3
 
@@ -31,36 +30,59 @@ class WallPieces(NamedTuple):
 
 
 class Solids(NamedTuple):
-    """Polygons with heights and information fractions, collected from the tables."""
+    """Polygons with heights, information fractions and names, collected from the tables."""
 
     rings: list[FloatArray]
     low: list[float]
     high: list[float]
     share: list[float]
+    names: list[str]
 
-    def add(self, ring: FloatArray, low: float, high: float, share: float) -> None:
+    def add(self, ring: FloatArray, low: float, high: float, share: float, name: str) -> None:
         """Add a polygon."""
         self.rings.append(ring)
         self.low.append(low)
         self.high.append(high)
         self.share.append(share)
+        self.names.append(name)
+
+
+class Built(NamedTuple):
+    """The obstacles of a file.
+
+    Attributes
+    ----------
+    obstacles, names
+        All obstacles, and their names with their positions in the plan.
+    walls
+        The walls piece by piece, with their openings.
+    gaps
+        The openings: ``polygon``, ``low_m`` and ``high_m`` of each.
+    """
+
+    obstacles: Obstacles
+    names: tuple[str, ...]
+    walls: WallPieces
+    gaps: list[dict[str, Any]]
 
 
 def read_obstacles(
     tables: Mapping[str, list[dict[str, Any]]], materials: Mapping[str, float], blocked: float
-) -> tuple[Obstacles, WallPieces]:
+) -> Built:
     """Return all obstacles, and the walls piece by piece.
 
-    `tables` are ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``. `materials`
-    are information fractions by name, which override those of the standard materials; `blocked` is
-    that of obstacles without their own.
+    `tables` are ``obstacles``, ``walls``, ``openings``, ``slabs``, and whether there are
+    ``mounts``. `materials` are information fractions by name, which override those of the standard
+    materials; `blocked` is that of obstacles without their own.
     """
-    boxes, solids, walls = [], Solids([], [], [], []), []
-    for name, table in _each(tables, "obstacles"):
+    boxes, of_boxes, solids = [], [], Solids([], [], [], [], [])
+    for name, title, table in _each(tables, "obstacles"):
         share = _share(name, table, materials)
         if "polygon" in table:
             _check_rises(name, table)
-            solids.add(table["polygon"], table["low_m"], table["high_m"], share)
+            ring = table["polygon"]
+            title += _ends(ring.min(axis=0), ring.max(axis=0))
+            solids.add(ring, table["low_m"], table["high_m"], share, title)
             continue
         low, high = np.array(table["low"]), np.array(table["high"])
         if not (high > low).all():
@@ -69,31 +91,68 @@ def read_obstacles(
         is_box = math.isnan(share) and not tables.get("mounts")
         if not is_box and (high - low).min() < 1e-3:
             raise ValueError(f"{name} must be at least a millimetre wide, got {show(high - low)}")
+        title += _ends(low, high)
         if is_box:
             boxes.append([*0.5 * (low + high), *0.5 * (high - low)])
+            of_boxes.append(title)
         else:
-            solids.add(rectangle(low, high), low[2], high[2], share)
-    for name, table in _each(tables, "walls"):
+            solids.add(rectangle(low, high), low[2], high[2], share, title)
+    walls, gaps = _walls(tables, materials, solids)
+    for name, title, table in _each(tables, "slabs"):
+        share, ring = _share(name, table, materials), table["polygon"]
+        title += _ends(ring.min(axis=0), ring.max(axis=0))
+        solids.add(ring, table["z_m"], table["z_m"] + table["thickness_m"], share, title)
+    prisms = Prisms.packed(*solids[:4])
+    obstacles = Obstacles(np.array(boxes).reshape(-1, 6), blocked, prisms)
+    return Built(obstacles, (*of_boxes, *solids.names), walls, gaps)
+
+
+def _walls(
+    tables: Mapping[str, Any], materials: Mapping[str, float], solids: Solids
+) -> tuple[WallPieces, list[dict[str, Any]]]:
+    """Add the walls to the solids, without their openings; return their pieces, and the gaps."""
+    openings = _openings(tables)
+    walls, gaps, unused = [], [], {opening.table for opening in openings}
+    for name, title, table in _each(tables, "walls"):
         share = _share(name, table, materials)
         _check_rises(name, table)
         line, half = table["line"], 0.5 * table["thickness_m"]
         if table["closed"]:
             line = check_polygon(f"{name}.line", line)
-        for ring in wall_pieces(line, half, table["closed"]):
-            solids.add(ring, table["low_m"], table["high_m"], share)
-        for start, end in segments(line, table["closed"]):
-            walls.append((start, end, half, table["low_m"], table["high_m"]))
-    for name, table in _each(tables, "slabs"):
-        share = _share(name, table, materials)
-        solids.add(table["polygon"], table["z_m"], table["z_m"] + table["thickness_m"], share)
-    prisms = Prisms.packed(*solids)
+        parts = segments(line, table["closed"])
+        for (start, end), ring in zip(parts, wall_pieces(line, half, table["closed"]), strict=True):
+            walls.append(Wall(start, end, half, table["low_m"], table["high_m"]))
+            rest, cut = opened(ring, walls[-1], openings)
+            for solid in rest:
+                solids.add(*solid, share, title + _ends(start, end))
+            for opening, gap in zip(openings, cut, strict=True):
+                if gap is not None:
+                    gaps.append(dict(zip(("polygon", "low_m", "high_m"), gap, strict=True)))
+                    unused.discard(opening.table)
+    if unused:
+        index = min(unused)
+        ends = tables["openings"][index]["line"][[0, -1]]
+        raise ValueError(
+            f"openings[{index}] must lie in one of [[walls]], along its line and between its "
+            f"heights, got a line from {show(ends[0])} to {show(ends[1])}"
+        )
     columns = (np.array(column) for column in zip(*walls, strict=True))
     pieces = WallPieces(*columns) if walls else WallPieces(*np.empty((2, 0, 2)), *np.empty((3, 0)))
-    return Obstacles(np.array(boxes).reshape(-1, 6), blocked, prisms), pieces
+    return pieces, gaps
 
 
-def _each(tables: Mapping[str, Any], kind: str) -> list[tuple[str, dict[str, Any]]]:
-    return [(f"{kind}[{i}]", table) for i, table in enumerate(tables.get(kind, []))]
+def _each(tables: Mapping[str, Any], kind: str) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return each table of a kind, with its name in errors and its name in the results."""
+    return [
+        (f"{kind}[{i}]", table.get("name") or f"{kind.removesuffix('s')} {i + 1}", table)
+        for i, table in enumerate(tables.get(kind, []))
+    ]
+
+
+def _ends(start: FloatArray, end: FloatArray) -> str:
+    """Return two points in the plan, to the centimetre, to find an obstacle by."""
+    x0, y0, x1, y1 = (f"{round(float(value), 2) + 0.0:.9g}" for value in (*start[:2], *end[:2]))
+    return f" ({x0}, {y0} to {x1}, {y1})"
 
 
 def _share(name: str, table: Mapping[str, Any], materials: Mapping[str, float]) -> float:
@@ -114,52 +173,21 @@ def _share(name: str, table: Mapping[str, Any], materials: Mapping[str, float]) 
     return math.nan if share is None else share
 
 
+def _openings(tables: Mapping[str, Any]) -> list[Opening]:
+    """Return the straight pieces of all openings."""
+    found = []
+    for index, (name, _, table) in enumerate(_each(tables, "openings")):
+        _check_rises(name, table)
+        for ends in segments(table["line"], closed=False):
+            found.append(Opening(np.array(ends), table["low_m"], table["high_m"], index))
+    return found
+
+
 def _check_rises(name: str, table: Mapping[str, Any]) -> None:
     if table["high_m"] - table["low_m"] < 1e-3:
         raise ValueError(
             f"{name}: low_m must lie below high_m, got {table['low_m']:g} and {table['high_m']:g}"
         )
-
-
-def segments(line: FloatArray, closed: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the straight pieces of a line (V, 2)."""
-    ends = np.roll(line, -1, axis=0)
-    return list(zip(line, ends, strict=True))[: None if closed else -1]
-
-
-def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]:
-    """Return quadrilaterals (4, 2) around the pieces of a line, mitred at their joints."""
-    found = []
-    parts = segments(line, closed)
-    along = np.array([(end - start) / np.hypot(*(end - start)) for start, end in parts])
-    for i, (start, end) in enumerate(parts):
-        left = half * _turned(along[i])
-        joined = [closed or i > 0, closed or i + 1 < len(parts)]
-        before, after = (
-            _mitre(along[k % len(parts)], along[i], half) if join else left
-            for k, join in zip((i - 1, i + 1), joined, strict=True)
-        )
-        ring = np.array([start - before, end - after, end + after, start + before])
-        # Mitres of a piece that is shorter than them would cross.
-        if min((ring[1] - ring[0]) @ along[i], (ring[2] - ring[3]) @ along[i]) < TOUCH_M:
-            ring = np.array([start - left, end - left, end + left, start + left])
-        found.append(ring)
-    return found
-
-
-def _mitre(one: FloatArray, other: FloatArray, half: float) -> FloatArray:
-    """Return the vector from a corner of two directions to the intersection of their left sides."""
-    middle = _turned(one) + _turned(other)
-    square = middle @ middle
-    # cos^2 of half the turn is square / 4.
-    if square * _LONGEST_MITRE**2 < 4:
-        return half * _turned(other)
-    return 2 * half * middle / square
-
-
-def _turned(direction: FloatArray) -> FloatArray:
-    """Return vectors rotated by 90 degrees to the left."""
-    return np.array([-direction[1], direction[0]])
 
 
 def read_mounts(tables: list[dict[str, Any]], walls: WallPieces) -> list[Mount]:
@@ -185,7 +213,7 @@ def _wall(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]
             continue
         for start, end in segments(line, table["closed"]):
             ends = np.array([start, end] if side == "left" else [end, start])
-            normal = _turned((ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0])))
+            normal = turned((ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0])))
             shift = table["offset_m"] + _in_wall(ends, normal, table, walls)
             found.append(_upright(ends + shift * normal, normal, table))
     return found
@@ -215,7 +243,7 @@ def _ceiling(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mou
 def _column(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]:
     found = []
     for start, end in segments(table["polygon"], closed=True):
-        normal = -_turned((end - start) / np.hypot(*(end - start)))
+        normal = -turned((end - start) / np.hypot(*(end - start)))
         found.append(_upright(np.array([start, end]), normal, table))
     return found
 

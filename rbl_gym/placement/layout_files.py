@@ -15,6 +15,8 @@ from rbl_gym.checks import FloatArray
 __all__ = ["Layout", "read_layout"]
 
 _AXES = ("x_m", "y_m", "z_m")
+# Headings of the files of anchors of `rbl-gym replay` and `rbl-gym calibrate`.
+_SAME = {"x": "x_m", "y": "y_m", "z": "z_m", "anchor": "name", "id": "name"}
 
 
 class Layout(NamedTuple):
@@ -27,8 +29,9 @@ class Layout(NamedTuple):
 def read_layout(path: str) -> Layout:
     """Read anchors from a CSV file with the columns x_m, y_m, z_m and optionally name.
 
-    Columns may be in any order, and other columns are ignored. Separators are commas or semicolons.
-    Without names the anchors are called 1, 2, ...
+    The columns may also be called x, y, z and anchor or id, as for `rbl-gym replay`. They may be in
+    any order, and other columns are ignored. Separators are commas or semicolons. Without names the
+    anchors are called 1, 2, ...
 
     Parameters
     ----------
@@ -56,11 +59,12 @@ def parse_layout(path: str, content: bytes) -> Layout:
     except csv.Error as error:
         raise ValueError(f"{path}, line {lines.line_num}: {error}") from error
     header = [cell.strip().lower() for cell in rows[0][1]] if rows else []
+    header = [name if _SAME.get(name, name) in header else _SAME.get(name, name) for name in header]
     missing = [name for name in _AXES if name not in header]
     if missing:
         raise ValueError(
-            f"{path}: the first line must name the columns x_m, y_m, z_m and optionally name; "
-            f"{', '.join(missing)} not found in {first.strip()[:80]!r}"
+            f"{path}: the first line must name the columns x_m, y_m, z_m (or x, y, z) and "
+            f"optionally name; {', '.join(missing)} not found in {first.strip()[:80]!r}"
         )
     columns = [header.index(name) for name in _AXES]
     at_name = header.index("name") if "name" in header else None
@@ -71,7 +75,7 @@ def parse_layout(path: str, content: bytes) -> Layout:
                 f"{path}, line {line}: must have {len(header)} cells like the header, got "
                 f"{len(row)}"
             )
-        positions.append([_number(path, line, header[k], row[k]) for k in columns])
+        positions.append([_number(path, line, rows[0][1][k].strip(), row[k]) for k in columns])
         names.append(str(len(names) + 1) if at_name is None else row[at_name].strip())
         if not names[-1] or names.index(names[-1]) < len(names) - 1:
             raise ValueError(

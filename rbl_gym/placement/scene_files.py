@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import placement
 from rbl_gym.checks import FloatArray, as_tuples, check_array, check_number, did_you_mean
-from rbl_gym.geometry.obstacles import Obstacles, Prisms, inside
+from rbl_gym.geometry.obstacles import Prisms, inside
 from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements.gain import Gain
@@ -29,7 +29,7 @@ from rbl_gym.placement.file_checks import check_numbers, check_problem
 from rbl_gym.placement.file_keys import BODIES, FORMAT, MAX_ANCHORS, MIN_ANCHORS
 from rbl_gym.placement.file_lines import advice, line_of
 from rbl_gym.placement.file_tables import as_table, check_text, read_table
-from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, show
+from rbl_gym.placement.file_walls import Built, read_mounts, read_obstacles, show
 from rbl_gym.placement.mounting import cut_mounts
 from rbl_gym.placement.outline import outside
 from rbl_gym.worlds import scenes
@@ -141,7 +141,7 @@ def of_mapping(
     anchors = read_table("anchors", anchors)
     noise, blocked = _noise(tables["noise"])
     prior = read_table("prior", tables.get("prior", {}))
-    obstacles, walls = read_obstacles(lists, _materials(tables.get("materials", {})), blocked)
+    built = read_obstacles(lists, _materials(tables.get("materials", {})), blocked)
     number = anchors["number"] if n_anchors is None else n_anchors
     if number is None:
         raise ValueError("anchors.number must be given, in the file or by --anchors")
@@ -160,18 +160,20 @@ def of_mapping(
             name=check_text("name", tables.get("name", name)),
             tags=as_tuples(_tags(tables["body"])),
             noise=noise,
-            obstacles=as_tuples(obstacles.boxes),
-            prisms=obstacles.prisms,
+            obstacles=as_tuples(built.obstacles.boxes),
+            prisms=built.obstacles.prisms,
             blocked_information=blocked,
-            anchor_region=_mounts(anchors, lists, obstacles, walls),
+            anchor_region=_mounts(anchors, lists, built),
             gain=_gain(anchors),
             initial_rotation_rad=math.radians(prior["rotation_deg"]),
             initial_translation_m=prior["position_m"],
         )
     )
+    found = replace(found, obstacle_names=built.names)
     if not lists["mounts"]:
         return found
-    return replace(found, notes=outside(found, walls, read_mounts(lists["mounts"], walls)))
+    mounts = read_mounts(lists["mounts"], built.walls)
+    return replace(found, notes=outside(found, built.walls, mounts))
 
 
 def with_anchors(problem: Problem, n_anchors: int) -> Problem:
@@ -235,9 +237,7 @@ def _materials(table: Any) -> dict[str, float]:
     }
 
 
-def _mounts(
-    anchors: dict[str, Any], lists: dict[str, Any], obstacles: Obstacles, walls: WallPieces
-) -> Region:
+def _mounts(anchors: dict[str, Any], lists: dict[str, Any], built: Built) -> Region:
     """Return the legal anchor positions."""
     rows, forbidden = lists["mounts"], lists["forbidden"]
     kind: Any = anchors.get("kind")
@@ -250,9 +250,11 @@ def _mounts(
         return _named("anchors", _REGIONS[kind], **{key: anchors[key] for key in sizes})
     if kind is not None:
         raise ValueError("the file must have either anchors.kind or [[mounts]], got both")
-    columns = [[row[key] for row in forbidden] for key in ("polygon", "low_m", "high_m")]
+    # Where a wall is open there is no face.
+    bans = [*forbidden, *built.gaps]
+    columns = [[row[key] for row in bans] for key in ("polygon", "low_m", "high_m")]
     mounts = cut_mounts(
-        read_mounts(rows, walls), obstacles, _named("forbidden", Prisms.of, columns)
+        read_mounts(rows, built.walls), built.obstacles, _named("forbidden", Prisms.of, columns)
     )
     if mounts is None:
         raise ValueError(

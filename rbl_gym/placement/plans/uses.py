@@ -6,7 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 from rbl_gym.checks import did_you_mean
-from rbl_gym.placement.file_keys import MATERIALS
+from rbl_gym.placement.building import ATTITUDES
+from rbl_gym.placement.file_keys import FORMAT, MATERIALS
 
 __all__ = ["KEYS", "KINDS", "Use", "parse_use"]
 
@@ -25,6 +26,11 @@ KEYS = {
 }
 KINDS = tuple(KEYS)
 TEXTS = {"material", "name", "attitude", "kind", "side"}
+_CHOICES = {
+    "attitude": ATTITUDES,
+    "kind": tuple(form.value for form in FORMAT["mounts"].forms),
+    "side": ("left", "right", "both"),
+}
 
 
 class Use(NamedTuple):
@@ -41,7 +47,7 @@ def parse_use(kind: str, text: str) -> Use:
     Raises
     ------
     ValueError
-        If entries of this kind have no such key.
+        If entries of this kind have no such key, or the key no such value.
     """
     layer, *parts = (part.strip() for part in text.split(","))
     if not layer or "=" in layer:
@@ -55,6 +61,10 @@ def parse_use(kind: str, text: str) -> Use:
             raise ValueError(
                 f"--{kind} {layer}: unknown key {key!r}; the keys are {', '.join(KEYS[kind])}"
                 f"{did_you_mean(key, KEYS[kind])}"
+            )
+        if value not in _CHOICES.get(key, (value,)):
+            raise ValueError(
+                f"--{kind} {layer}: {key} must be one of {', '.join(_CHOICES[key])}, got {value!r}"
             )
         values[key] = value if key in TEXTS else number(f"--{kind} {layer}: {key}", value)
     if (

@@ -11,7 +11,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.sample import prior_of
 from rbl_gym.studies.placing.accuracy import spread_places
-from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
+from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of, short_row
 from rbl_gym.studies.placing.links import anchor_information
 from rbl_gym.studies.placing.ranking import rank
 from rbl_gym.studies.placing.requirements import Limits, turns, value_at_share
@@ -217,7 +217,7 @@ def fewest_anchors(
     Raises
     ------
     ValueError
-        If no zone has a requirement.
+        If no zone has a requirement, or a zone fails even with an anchor at every candidate.
     """
     if not any(limits_of(zone).any() for zone in problem.zones):
         raise ValueError(
@@ -228,6 +228,8 @@ def fewest_anchors(
     rng = np.random.default_rng([seed, 6])
     points = first_then_others(problem.fixed, candidates(problem, rng))
     stock = stock_of(problem, points, seed)
+    if value(stock, range(len(points))) >= 0:
+        _check_reachable(problem, points, seed)
     plain = stock._replace(zones=tuple(z._replace(limits=Limits()) for z in stock.zones))
     path = _growth(stock, keep, numbers[-1], survive)
     paths = path, _growth(plain, keep, max(path), survive)
@@ -265,6 +267,21 @@ def fewest_anchors(
     if less is None:
         return Fewest(anchors, judged, best.met, None, [], proved, 0)
     return Fewest(anchors, judged, best.met, less.anchors, less.judged, proved, less.searches)
+
+
+def _check_reachable(problem: Problem, points: FloatArray, seed: int) -> None:
+    """Raise ValueError if a zone fails even with an anchor at every candidate (K, 3)."""
+    found = [
+        f"zone {row['name']!r} would pass only with limits {row['would_pass']['factor']:.3g} times "
+        f"as large ({row['decides']['requirement']} = {row['decides']['limit']:g} decides)"
+        for row in map(short_row, judge(problem, points, seed, most=PLACES))
+        if row["verdict"] == "fail"
+    ]
+    if found:
+        raise ValueError(
+            "fewest: no number of anchors meets the requirements. With an anchor at each of "
+            f"{len(points)} positions on the mounts, {'; '.join(found)}"
+        )
 
 
 class _Found(NamedTuple):

@@ -28,6 +28,8 @@ _SLAB_M, _SLAB_M2 = 0.6, 20.0
 _BELOW_M, _FURNITURE_M = 0.5, 1.8
 # A tape runs this far in front of a wall; edges closer than this are the wall itself, metres.
 _FREE_M, _SAME_M = 0.005, 0.02
+# Points closer than this are the same, metres.
+_TOUCH_M = 1e-6
 # Two tapes fix a position only if the sine of the angle between them is not smaller.
 _ACROSS = 0.5
 
@@ -61,9 +63,10 @@ def measured_from(problem: Problem, anchor: FloatArray, normal: FloatArray) -> l
 
     Each has ``side``, ``to``, ``x_m``, ``y_m`` and ``distance_m``. The point (x, y) can be seen
     from the anchor. For an anchor on a wall, the sides are ``left`` and ``right`` as one faces the
-    wall, and `to` is ``wall``, the next wall in the corner, or ``end of the wall``. For others the
-    distances are at right angles to two walls, or to an ``edge of the mount`` where no wall is
-    seen, and the side is the direction of the wall.
+    wall, and `to` is the next wall in the corner, or ``end of the wall``. For others the distances
+    are at right angles to two walls, or to an ``edge of the mount`` where no wall is seen, and the
+    side is the direction of the wall. A wall or obstacle of a file has the name of
+    `Problem.obstacle_names`; the line of a mount is called ``wall``.
 
     Parameters
     ----------
@@ -72,14 +75,15 @@ def measured_from(problem: Problem, anchor: FloatArray, normal: FloatArray) -> l
     normal
         Direction (3,) in which the anchor faces; zero for all directions.
     """
-    place, edges = anchor[:2], _edges(problem, anchor)
+    place, (edges, names) = anchor[:2], _edges(problem, anchor)
     if abs(normal[2]) < 0.5 and normal.any():
-        found = _along_wall(place, normal[:2] / np.linalg.norm(normal[:2]), edges)
+        found = _along_wall(place, normal[:2] / np.linalg.norm(normal[:2]), edges, names)
     else:
-        found = _at_right_angles(place, edges, len(edges))
+        found = _at_right_angles(place, edges, names)
         if len(found) < 2:
-            every = np.concatenate([edges, _outline(problem)])
-            found = _at_right_angles(place, every, len(edges))
+            more = _outline(problem)
+            names += ["edge of the mount"] * len(more)
+            found = _at_right_angles(place, np.concatenate([edges, more]), names)
     rows = []
     for side, to, point in found:
         x, y = (round(float(value), 3) + 0.0 for value in point)
@@ -89,17 +93,23 @@ def measured_from(problem: Problem, anchor: FloatArray, normal: FloatArray) -> l
 
 
 def _along_wall(
-    place: FloatArray, normal: FloatArray, edges: FloatArray
+    place: FloatArray, normal: FloatArray, edges: FloatArray, names: list[str]
 ) -> list[tuple[str, str, FloatArray]]:
     """Return the ends of the wall of a position, to the left and to the right of it."""
     left = np.array([normal[1], -normal[0]])
+    sides = [("left", left), ("right", -left)]
+    ends = [_end(place, along, edges) for _, along in sides]
     found = []
-    for side, along in (("left", left), ("right", -left)):
-        end = _end(place, along, edges)
-        hit = _first_hit(place + _FREE_M * normal, along, edges)
+    for (side, along), end in zip(sides, ends, strict=True):
+        # An anchor in the corner touches the next wall: only edges that the tape would enter.
+        across = edges[:, 1] - edges[:, 0]
+        ahead = np.flatnonzero(along[1] * across[:, 0] - along[0] * across[:, 1] > 0)
+        start = place + _FREE_M * normal - _TOUCH_M * along
+        hit, k = _first_hit(start, along, edges[ahead])
+        hit = max(hit - _TOUCH_M, 0.0)
         if hit <= end + _SAME_M:
-            found.append((side, "wall", place + hit * along))
-        elif end > 0:
+            found.append((side, names[ahead[k]], place + hit * along))
+        elif max(ends) > 0:
             found.append((side, "end of the wall", place + end * along))
     return found
 
@@ -117,8 +127,8 @@ def _end(place: FloatArray, along: FloatArray, edges: FloatArray) -> float:
         end = float(joined[:, 1].max())
 
 
-def _first_hit(start: FloatArray, along: FloatArray, edges: FloatArray) -> float:
-    """Return the distance along a ray to the first edge; infinite if there is none."""
+def _first_hit(start: FloatArray, along: FloatArray, edges: FloatArray) -> tuple[float, int]:
+    """Return the distance along a ray to the first edge, and its index; infinite if none."""
     side = edges[:, 1] - edges[:, 0]
     off = edges[:, 0] - start
     turn = along[0] * side[:, 1] - along[1] * side[:, 0]
@@ -127,16 +137,14 @@ def _first_hit(start: FloatArray, along: FloatArray, edges: FloatArray) -> float
     reach = (off[:, 0] * side[:, 1] - off[:, 1] * side[:, 0]) / safe
     share = (off[:, 0] * along[1] - off[:, 1] * along[0]) / safe
     hit = crosses & (reach > 1e-9) & (share >= -1e-9) & (share <= 1 + 1e-9)
-    return float(reach[hit].min(initial=np.inf))
+    least = float(reach[hit].min(initial=np.inf))
+    return least, int((hit & (reach <= least + _TOUCH_M)).argmax()) if hit.any() else -1
 
 
 def _at_right_angles(
-    place: FloatArray, edges: FloatArray, walls: int
+    place: FloatArray, edges: FloatArray, names: list[str]
 ) -> list[tuple[str, str, FloatArray]]:
-    """Return the nearest visible wall, and the nearest one across it, at right angles to each.
-
-    The first `walls` edges are walls, the others edges of mounts.
-    """
+    """Return the nearest visible wall, and the nearest one across it, at right angles to each."""
     side = edges[:, 1] - edges[:, 0]
     length = np.linalg.norm(side, axis=1)
     side = side / np.maximum(length, 1e-9)[:, None]
@@ -146,7 +154,7 @@ def _at_right_angles(
     on_edge = (length > 1e-6) & (share >= -1e-9) & (share <= length + 1e-9)
     found: list[tuple[str, str, FloatArray]] = []
     first: FloatArray | None = None
-    for k in np.argsort(distance, kind="stable").tolist():
+    for k in np.argsort(np.round(distance, 6), kind="stable").tolist():
         if not on_edge[k]:
             continue
         # The wall is to the left of its edge; an anchor may touch it.
@@ -154,30 +162,31 @@ def _at_right_angles(
         along = inward if distance[k] < _SAME_M else (feet[k] - place) / distance[k]
         if first is not None and abs(along[0] * first[1] - along[1] * first[0]) < _ACROSS:
             continue
-        if _first_hit(place, along, edges) < distance[k] - 1e-6:
+        if _first_hit(place, along, edges)[0] < distance[k] - _TOUCH_M:
             continue
-        to = "wall" if k < walls else "edge of the mount"
-        found.append((direction(np.array([*along, 0.0])), to, feet[k]))
+        found.append((direction(np.array([*along, 0.0])), names[k], feet[k]))
         if first is not None:
             break
         first = along
     return found
 
 
-def _edges(problem: Problem, anchor: FloatArray) -> FloatArray:
+def _edges(problem: Problem, anchor: FloatArray) -> tuple[FloatArray, list[str]]:
     """Return edges (K, 2, 2) of the obstacles that reach an anchor, and of mounts on walls.
 
-    The solid side is to the left of an edge.
+    The solid side is to the left of an edge. The second result are the names of what is there.
     """
     prisms = problem.obstacles.prisms
     lows, highs = box_bounds(problem.obstacles.boxes)
+    rings = [*rectangle(lows, highs), *prisms.corners]
+    bottom, top = np.append(lows[:, 2], prisms.low_m), np.append(highs[:, 2], prisms.high_m)
     z = float(anchor[2])
     head = min(z - 1e-6, max(z - _BELOW_M, floor_below(problem, anchor) + _FURNITURE_M))
-    rings = list(rectangle(lows, highs)[(lows[:, 2] < z) & (highs[:, 2] > head)])
-    for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
-        if low < z and high > head:
-            rings.append(ring)
-    found = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]
+    names = problem.obstacle_names or [f"obstacle {k + 1}" for k in range(len(rings))]
+    found, titles = [], []
+    for k in np.flatnonzero((bottom < z) & (top > head)).tolist():
+        found.append(np.stack([rings[k], np.roll(rings[k], -1, axis=0)], axis=1))
+        titles += [names[k]] * len(rings[k])
     faces = problem.mounts.faces
     upright = (np.abs(faces.axes[..., 2]) > 0.5) & (faces.extents > 0)
     for k in np.flatnonzero(upright.any(axis=1)).tolist():
@@ -188,7 +197,8 @@ def _edges(problem: Problem, anchor: FloatArray) -> FloatArray:
             away = line[1] - line[0]
             faces_left = away[0] * faces.normal[k, 1] > away[1] * faces.normal[k, 0]
             found.append(line[None, ::-1] if faces_left else line[None])
-    return np.concatenate([*found, np.empty((0, 2, 2))])
+            titles.append("wall")
+    return np.concatenate([*found, np.empty((0, 2, 2))]), titles
 
 
 def _outline(problem: Problem) -> FloatArray:
