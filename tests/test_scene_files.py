@@ -236,7 +236,7 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("obstacles", {"low": 1}, "obstacles must be a list"),
         ("obstacles.0", 4, "obstacles[0] must be a table"),
         ("obstacles.0.low", [5, 2, 0], "obstacles[0]: low must lie below high"),
-        ("obstacles.0.name", "rack", "obstacles[0] has an unknown key 'name'"),
+        ("obstacles.0.title", "rack", "obstacles[0] has an unknown key 'title'"),
         ("obstacles", [{"low": [0, 0, 0], "high": [8, 6, 2]}], "obstacles[0] covers the whole"),
         (
             "obstacles",

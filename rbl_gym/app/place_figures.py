@@ -135,7 +135,7 @@ def legend_text(problem: Problem) -> str:
     if problem.obstacles:
         parts.append("grey: obstacles, darker if they weaken links more")
     if any(shapes.is_overhead(problem, solid) for solid in shapes.solids_in_plan(problem)):
-        parts.append("dotted: overhead, such as walls above doors")
+        parts.append("dotted: overhead")
     return "     ".join(parts)
 
 
