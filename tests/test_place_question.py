@@ -133,6 +133,22 @@ def test_positions_fill_a_zone_evenly_and_outside_obstacles():
     assert deviations[1] < 0.5 * deviations[0]
 
 
+def test_a_flat_zone_is_judged_and_drawn_at_its_height():
+    tables = copy.deepcopy(ROOM)
+    for zone in tables["zones"]:
+        zone |= {"height_m": 0.2}
+    tables["zones"][0]["low"][2] = tables["zones"][0]["high"][2] = 0.5
+    tables["zones"][1]["low_m"] = tables["zones"][1]["high_m"] = 0.8
+    problem = scene_files.of_mapping(tables)
+    anchors = mounts(0, 1, 2, 3, 5, 7, 8)
+    for judged, height in zip(judging.judge(problem, anchors, 0), (0.5, 0.8), strict=True):
+        assert (judged.places[:, 2] == height).all()
+        assert (judging.at_edges(problem, anchors, judged).places[:, 2] == height).all()
+        assert accuracy.accuracy_map(problem, anchors, zone=judged.zone).at == height
+        # The height is estimated, although the zone has only one.
+        assert (judged.errors.height > 0.01).all()
+
+
 def test_layouts_are_judged_side_by_side_at_the_same_positions():
     problem = room()
     one, other = mounts(0, 1, 2, 3, 5, 7, 8), mounts(0, 2, 4, 5, 9)
