@@ -115,6 +115,7 @@ BUILDING = {
     "forbidden": [{"polygon": [[3, -1], [4, -1], [4, 1]], "low_m": 2, "high_m": 3}],
     "walls": [{"line": [[0, 0], [9, 0], [9, 7], [0, 7]], "closed": True, "thickness_m": 0.2,
                "high_m": 3, "material": "glass"}, {"line": [[3, 1], [3, 5]], "high_m": 3}],
+    "openings": [{"line": [[2, 0], [3, 0]]}],
     "obstacles": [{"polygon": [[4, 3], [5, 3], [5, 4]], "high_m": 3, "information": 0.1},
                   {"low": [6, 3, 0], "high": [7, 5, 2]},
                   {"low": [6, 1, 0], "high": [7, 2, 2], "material": "glass"}],

@@ -67,6 +67,18 @@ def test_the_requirement_that_decides_and_the_distance_of_the_tags_that_meets_it
     assert judged_row(wider)[1]["decides"]["value"] == pytest.approx(2.0, rel=0.05)
 
 
+def test_requirements_that_only_fail_together():
+    zone = {
+        "name": "a", "verdict": "fail", "required": {"share": 0.95},
+        "decides": {"requirement": "heading_deg", "value": 7.7, "limit": 8.0},
+    }  # fmt: skip
+    (note,) = deciding_notes({"zones": [zone], "tags_m": [[0, 0, 0]]})
+    assert note == (
+        "The heading decides in zone 'a': at 95 % of the positions 7.70 deg (required: 8 deg), but "
+        "at other positions other requirements are missed."
+    )
+
+
 def test_a_position_that_decides_with_one_anchor_less():
     zone = {
         "name": "a", "verdict": "fail", "required": {"share": 0.95},

@@ -38,6 +38,8 @@ def deciding_notes(result: dict[str, Any]) -> list[str]:
             if value is None
             else f"{digits(value, 3)} {unit} (required: {limit:g} {unit})"
         )
+        if value is not None and value <= limit:
+            reached += ", but at other positions other requirements are missed"
         texts.append(
             f"{where}the {name} decides in zone {zone['name']!r}: at "
             f"{100 * zone['required']['share']:g} % of the positions {reached}"
