@@ -82,7 +82,7 @@ class Asynchronous:
     Parameters
     ----------
     filter
-        Any filter.
+        Any filter whose `predict` takes a twist; not `iekf-imu`, which takes sensor readings.
     anchors
         (M, 3), positions in metres. Each call of `add` may give other positions.
     n_tags

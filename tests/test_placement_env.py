@@ -225,7 +225,7 @@ def test_contexts_are_those_in_info():
         ({"mode": "all"}, "mode must be one of 'sequential', 'one-shot', 'mounts', got 'all'"),
         ({"mode": "mounts"}, "scene must have walls for mount points, got 'auv_buoys'"),
         ({"racks": 1}, "racks must be 0 outside a named room"),
-        ({"sight": True}, "sight must be False with racks=0: only racks block"),
+        ({"sight": True}, "sight must be False with racks=0 in a scene without obstacles"),
         ({"sight": 1}, "sight must be True or False, got 1"),
         ({"racks": 1.5}, "racks must be an int from 0 to 2, got 1.5"),
         ({"n_anchors": 0}, "n_anchors must be"),

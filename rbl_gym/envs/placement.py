@@ -40,7 +40,10 @@ class AnchorPlacementVectorEnv(PlacementBatchEnv):
         self.task = placement.task(scene, n_anchors, racks)
         self._check_flags(mode, mirror, sight)
         if sight and not self.task.racks and not self.task.scene.obstruction:
-            raise ValueError("sight must be False with racks=0: only racks block the line of sight")
+            raise ValueError(
+                "sight must be False with racks=0 in a scene without obstacles: nothing blocks the "
+                "line of sight"
+            )
         self.mirror = mirror and is_symmetric(self.task)
         self._plan(self.task, self.task.n_anchors, 6 + 6 * self.task.racks)
         # An episode terminates with the last anchor.
