@@ -73,8 +73,8 @@ def warnings(result: dict[str, Any]) -> list[str]:
         found.append(
             "All anchors lie in one plane. A body on the other side of the plane (for anchors on a "
             "ceiling: above it) has almost the same ranges. This is harmless if the body cannot be "
-            "there and the filter is told so (rbl-gym replay --below-anchors or --volume). Without this, "
-            "a filter may follow the wrong side, and the linear filters (kf, uc-kf, et-kf, "
+            "there and the filter is told so (rbl-gym replay --below-anchors or --volume). Without "
+            "this, a filter may follow the wrong side, and the linear filters (kf, uc-kf, et-kf, "
             f"kf-ortho) do not work. {_way_out(result)}"
         )
     for zone in result["zones"]:

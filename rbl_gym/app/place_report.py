@@ -114,8 +114,8 @@ def notes(result: dict[str, Any]) -> list[str]:
     if result["obstacles"]:
         found.append(
             "'not told': the filter does not know which links are blocked. The others know, "
-            "as some radios report it, and weigh these links less. The prediction assumes the same, "
-            "so a 'no' of 'not told' does not contradict it."
+            "as some radios report it, and weigh these links less. The prediction does so too: "
+            "a 'no' of 'not told' does not contradict it."
         )
     return found
 
