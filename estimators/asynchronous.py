@@ -16,6 +16,9 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_count, check_number
 from rbl_gym.estimators.filter import Filter, PoseBelief
+from rbl_gym.estimators.iekf.inertial import InertialEkf
+from rbl_gym.estimators.iekf.odometry import OdometryEkf
+from rbl_gym.estimators.linear.kalman import KalmanFamily
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
 
 
@@ -82,7 +85,9 @@ class Asynchronous:
     Parameters
     ----------
     filter
-        Any filter whose `predict` takes a twist; not `iekf-imu`, which takes sensor readings.
+        An iterated EKF whose `predict` takes a twist, or a filter of your own. ValueError for the
+        linear filters, to which single ranges tell nothing, and for those that take sensor readings
+        (``"iekf-imu"``, ``"iekf-log"`` with odometry).
     anchors
         (M, 3), positions in metres. Each call of `add` may give other positions.
     n_tags
@@ -104,6 +109,16 @@ class Asynchronous:
     window_s: float = 0.1
 
     def __post_init__(self) -> None:
+        kind = type(self.filter).__name__
+        if isinstance(self.filter, KalmanFamily):
+            raise ValueError(
+                f"filter must use single ranges, got {kind}: it uses differences between the "
+                "ranges of an epoch; use an iterated EKF"
+            )
+        if isinstance(self.filter, InertialEkf | OdometryEkf):
+            raise ValueError(
+                f"filter must predict from a twist, got {kind}: it needs the readings of a sensor"
+            )
         object.__setattr__(self, "anchors", check_array("anchors", self.anchors, ("M", 3)))
         if self.anchors.ndim != 2:
             raise ValueError(f"anchors must be (M, 3), got shape {self.anchors.shape}")

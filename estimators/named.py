@@ -197,7 +197,14 @@ def iekf_log(
     elif odometry is None:
         filter = AugmentedEkf(pose, law, None, (stays, moves), directions)
     else:
-        sensor = odometry if isinstance(odometry, OdometrySensor) else OdometrySensor(**odometry)
+        try:
+            sensor = (
+                odometry if isinstance(odometry, OdometrySensor) else OdometrySensor(**odometry)
+            )
+        except TypeError as error:
+            raise ValueError(
+                f"odometry must be an OdometrySensor, its fields, or None, got {odometry!r:.80}"
+            ) from error
         # A bias with zero standard deviation needs no states.
         biases = tuple(bias for bias in (stays, moves) if bias.std_m or bias.common_std_m)
         filter = OdometryEkf(pose, law, None, biases, directions, sensor)

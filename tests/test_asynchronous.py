@@ -170,6 +170,18 @@ def test_a_stream_that_cannot_be_is_refused():
         Asynchronous(links.filter, links.anchors, "4")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize("name", ["kf", "uc-kf", "et-kf", "kf-ortho"])
+def test_filters_to_which_one_range_tells_nothing_are_refused(name):
+    with pytest.raises(ValueError, match="filter must use single ranges, got KalmanFamily"):
+        stream_of(name, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("name", "options"), [("iekf-imu", {}), ("iekf-log", {"odometry": {}})])
+def test_filters_of_sensor_readings_are_refused(name, options):
+    with pytest.raises(ValueError, match="filter must predict from a twist, got"):
+        stream_of(name, np.random.default_rng(0), **options)
+
+
 def test_anchors_that_move_and_a_deviation_for_every_range():
     """As an epoch of one link with its anchors and its law; late ones find their own anchors."""
     rng = np.random.default_rng(5)

@@ -489,3 +489,15 @@ def test_settings_of_sensors_are_checked_and_known_by_their_fields():
     for wrong in ({"odometry_m": 0.0}, {"headings": 0}, {"gravity_tilt_deg": -1.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replay.Settings.of(**wrong)
+
+
+@pytest.mark.parametrize("odometry", [True, {"speed": 1.0}])
+def test_a_wrong_sensor_of_the_filter_is_named(odometry):
+    with pytest.raises(ValueError, match="odometry must be an OdometrySensor, its fields, or None"):
+        estimators.make(
+            "iekf-log",
+            tags=np.eye(3),
+            noise=ranging.RangeNoise(0.1),
+            process=motion.ProcessNoise(),
+            odometry=odometry,
+        )

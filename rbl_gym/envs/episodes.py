@@ -16,8 +16,6 @@ from rbl_gym.worlds.stacked import StackedScenes
 
 # Number of worlds built together, so that their intermediate results do not fill the memory.
 _BLOCK = 1024
-# Places in `simulation.Epoch` of the random numbers of the ranges.
-_DRAWN = tuple(map(simulation.Epoch._fields.index, ("normals", "uniforms")))
 
 
 class EpisodeStore:
@@ -84,9 +82,10 @@ class EpisodeStore:
                 *(None if one is None else self._empty(one.shape[1:]) for one in fields[5:]),
             ]
         rows = rows_of(worlds)
-        for k, (stored, field) in enumerate(zip(self._timed, fields, strict=True)):
-            # Random numbers are in place, and the motion is if the worlds are contiguous.
-            if k not in _DRAWN and stored is not None and field is not None:
+        for stored, field in zip(self._timed, fields, strict=True):
+            # Motion and random numbers are in place already: if the worlds are contiguous, and the
+            # store is not a copy of another, whose arrays are no longer views of each other.
+            if stored is not None and field is not None:
                 stored[:, rows] = np.swapaxes(field, 0, 1)
 
     def _empty(self, shape: tuple[int, ...]) -> FloatArray:
