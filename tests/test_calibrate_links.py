@@ -276,14 +276,49 @@ def test_a_truth_that_repeats_a_pose_and_jumps_does_not_tell_the_clock():
     held[1500:1544] = 1500
     frozen = Truth(truth.times, rotation[held], translation[held])
     settings = LinkSettings(tags="held")
-    whole, found = (
-        calibrate.calibrate_links(recording_of(times, ranges, one), settings).clock
+    results = [
+        calibrate.calibrate_links(recording_of(times, ranges, one), settings)
         for one in (truth, frozen)
-    )
+    ]
+    whole, found = (result.clock for result in results)
     assert whole is not None
     assert found is not None
+    assert results[0].figures["notes"] == []
+    (note,) = results[1].figures["notes"]
+    assert "repeats one pose for 0.43 s from 15.0" in note or "from 14.9" in note
     assert abs(found.offset_s - whole.offset_s) < 0.2 * whole.std_s
     assert found.std_s == pytest.approx(whole.std_s, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_position_of_an_anchor_and_a_wrong_link_are_named(seed):
+    rng = np.random.default_rng(seed)
+    times = 0.1 * np.arange(400)
+    truth = Truth(times, *path_of(times))
+    bias = 0.1 + 0.05 * rng.standard_normal((6, 4))
+    ranges = ranges_of(times, rng, bias=bias, slope=0.01 * rng.standard_normal((6, 4)), late=0.03)
+    recording = recording_of(times, ranges, truth)
+    figures = calibrate.calibrate_links(recording).figures
+    assert figures["notes"] == []
+    late = ranges.copy()
+    late[:, 2, 1] += 0.4
+    figures = calibrate.calibrate_links(recording._replace(ranges=late)).figures
+    (row,) = figures["outlying_links"]
+    assert (row["anchor"], row["tag"]) == ("A2", "T1")
+    assert row["offset_m"] == pytest.approx(0.4, abs=0.15)
+    assert figures["misplaced_anchors"] == []
+    (note,) = figures["notes"]
+    assert note.startswith("WARNING: the ranges of some links differ by more than 0.3 m")
+    angle = rng.uniform(0, 2 * np.pi)
+    move = 0.5 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    anchors = ANCHORS.copy()
+    anchors[4] -= move
+    figures = calibrate.calibrate_links(recording._replace(anchors=anchors)).figures
+    (row,) = figures["misplaced_anchors"]
+    assert row["anchor"] == "A4"
+    np.testing.assert_allclose(row["move_m"], move, atol=0.15)
+    assert {row["anchor"] for row in figures["outlying_links"]} <= {"A4"}
+    assert "anchor A4 looks misplaced" in figures["notes"][-1]
 
 
 @pytest.mark.parametrize("slopes", [True, False])

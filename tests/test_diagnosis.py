@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -209,6 +210,51 @@ def test_honest_logs_are_not_doubted():
         for b in range(200)
     ]
     assert sum(doubted) == 0
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_an_anchor_that_the_biases_of_the_filter_absorb_is_named(seed):
+    """0.5 m away in any horizontal direction. The innovations look sound."""
+    rng = np.random.default_rng(seed)
+    times = 0.1 * np.arange(250)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    place = np.array([5.0, 4, 1.5]) + np.stack(
+        [3 * np.sin(0.5 * times + phase[0]), 2.4 * np.sin(0.37 * times + phase[1]), 0 * times], -1
+    )
+    turn = rotations.exp((0.6 * times + np.sin(times + phase[2]))[:, None] * [0, 0, 1.0])
+    true = ranging.distances(ANCHORS, ranging.tag_positions(turn, place, TAGS))
+    ranges = true + 0.05 * rng.standard_normal((7, 5)) + 0.08 * rng.standard_normal(true.shape)
+    log = recorded.recording(times, ranges, ANCHORS, TAGS)
+    settings = replay.Settings.of(start=(*place[0], 30.0), tilt_std_deg=5.0)
+    assert not any(
+        "misplaced" in x for x in replay.replay_recording(log, settings).figures["notes"]
+    )
+    angle, m = rng.uniform(0, 2 * np.pi), int(rng.integers(7))
+    move = 0.5 * np.array([np.cos(angle), np.sin(angle), 0])
+    anchors = ANCHORS.copy()
+    anchors[m] -= move
+    figures = replay.replay_recording(log._replace(anchors=anchors), settings).figures
+    assert not figures["consistency"]["contradicts"]
+    (note,) = [note for note in figures["notes"] if "misplaced" in note]
+    found = re.search(r"^WARNING: anchor A(\d) looks misplaced: .* moved by \((.*)\) m", note)
+    assert found is not None
+    assert int(found[1]) == m
+    named = np.array([float(x) for x in found[2].split(",")])
+    # The tags move little in height.
+    assert (np.abs(named - move) < [0.15, 0.15, 0.4]).all()
+
+
+def test_the_constant_biases_of_a_track_are_those_of_the_links():
+    rng = np.random.default_rng(3)
+    bias = 0.1 * rng.standard_normal((7, 5))
+    settings = SETTINGS.changed(filter="iekf-log", range_std_m=0.1)
+    found: Any = replay.track_recording(recording(RANGES + bias), settings).biases
+    off = (found.mean_m - bias).ravel()
+    off, std = off - off.mean(), np.sqrt(np.diag(found.covariance))
+    assert np.abs(off).mean() < 0.6 * np.abs(bias - bias.mean()).mean()
+    # The biases are drawn from twice the law.
+    assert np.sqrt(np.mean((off / std) ** 2)) < 2.5
+    assert replay.track_recording(recording(RANGES), SETTINGS).biases is None
 
 
 def test_residuals_by_anchor_tag_and_link():

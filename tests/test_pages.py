@@ -255,6 +255,15 @@ def test_curves_break_at_gaps_of_the_log():
     path = next(line for line in lines if line.type == "scatter3d" and len(line.x) == 8)
     assert path.z[4] is None
     assert path.z[3] is not None
+    # The areas below 3 sigma are closed before the break, and again after it.
+    areas = [trace for trace in drawn(late).data if trace.name == "3 sigma"]
+    assert len(areas) == 2
+    for area in areas:
+        assert area.fill == "toself"
+        corners = [list(area.x[:7]), list(area.x[7:])]
+        assert corners[0] == [0, 0.1, 0.2, 0.3, 0.3, 0, None]
+        assert corners[1] == [5.4, 5.5, 5.6, 5.6, 5.4, None]
+        assert [k for k, y in enumerate(area.y) if y == 0] == [4, 5, 10, 11]
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -10,11 +10,12 @@ import pytest
 
 from rbl_gym import recordings
 from rbl_gym.app import reports
-from rbl_gym.geometry import rotations
+from rbl_gym.geometry import bodies, rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from rbl_gym.studies.frozen_truth import frozen_spells
 from rbl_gym.studies.replay.truth import check_overlap, matched, stamp_hints
-from tests.recorded import curve, honest_track
+from tests.recorded import curve, flight, honest_track
 
 
 def moving(step_s, duration_s=10.0, start_s=0.0):
@@ -96,6 +97,44 @@ def test_gaps_of_the_ranges_are_counted():
     }
     said = "has 2 gaps without ranges; the longest lasts 3.2 s from 5.9 s after the start."
     assert f"Note: the log {said}" in found["notes"]
+
+
+def test_a_truth_that_stays_while_the_ranges_change_is_noted():
+    tags = bodies.octahedron(0.8)
+    log = flight(tags, count=120)
+    truth: Any = log.truth
+    kept = np.arange(120)
+    kept[40:61] = 40
+    frozen = truth._replace(rotation=truth.rotation[kept], translation=truth.translation[kept])
+    late = frozen._replace(times=truth.times + 0.3)
+    settings = replay.Settings.of(range_std_m=0.06)
+    for one, changed, seen in (
+        (truth, {}, False),
+        (frozen, {}, True),
+        (late, {"time_offset": 0.3}, True),
+        (frozen, {"truth_exclude": ((4.0, 6.0),)}, False),
+    ):
+        found = replay.replay_recording(log._replace(truth=one), settings.changed(**changed))
+        notes = [note for note in found.figures["notes"] if "repeats one pose" in note]
+        assert len(notes) == seen
+        if seen:
+            assert "for 2.00 s from 4.00 s on, while the ranges change" in notes[0]
+            assert notes[0].endswith("--truth-exclude 4.00:6.00.")
+    # A body that rests as long is no fault.
+    rests = log._replace(ranges=log.ranges[kept] + 0.05 * noise_of(log), truth=frozen)
+    assert frozen_spells(rests) == []
+    # Noise alone must not say otherwise: the pose of a whole log.
+    still = frozen._replace(
+        rotation=np.repeat(truth.rotation[:1], 120, 0),
+        translation=np.repeat(truth.translation[:1], 120, 0),
+    )
+    for seed in range(20):
+        ranges = log.ranges[:1] + 0.05 * noise_of(log, seed)
+        assert frozen_spells(log._replace(ranges=ranges, truth=still)) == []
+
+
+def noise_of(log, seed=0):
+    return np.random.default_rng(seed).standard_normal(log.ranges.shape)
 
 
 def test_no_common_time_names_what_lies_between():

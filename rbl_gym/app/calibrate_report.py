@@ -18,10 +18,13 @@ def print_calibrated(figures: dict[str, Any]) -> None:
 def _print_anchors(figures: dict[str, Any]) -> None:
     console = new_console()
     title = f"{figures['ranges']} ranges of {figures['epochs']} epochs [m]"
-    table = new_table(title, ["anchor"], _PLACE)
+    # Without a table to start from there is no given position.
+    given = all(row["moved_m"] is not None for row in figures["anchors"])
+    table = new_table(title, ["anchor"], (*_PLACE, *["moved"] * given))
     for row in figures["anchors"]:
         std = ["known"] * 3 if row["known"] else [f"{x:.3f}" for x in row["std_m"]]
-        table.add_row(row["anchor"], *(f"{x:.3f}" for x in row["place_m"]), *std)
+        moved = [f"{row['moved_m']:.3f}"] * given
+        table.add_row(row["anchor"], *(f"{x:.3f}" for x in row["place_m"]), *std, *moved)
     console.print(table)
     console.print(f"Frame: {figures['frame']}.")
     console.print(
@@ -121,6 +124,7 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
         f"{text}; {100 * noise['beyond_3_std']:.1f} % of the ranges are off by more than three "
         "standard deviations."
     )
+    said += figures["notes"]
     said += [f"Not determined: {what}." for what in figures["not_determined"]]
     return said
 

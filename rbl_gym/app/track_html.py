@@ -108,6 +108,18 @@ class _Curves:
         """Return values (K, ...) at the points of a curve; NaN at a break."""
         return np.insert(np.asarray(values[self._points], float), self._breaks, np.nan, axis=0)
 
+    def under(self, times: FloatArray, values: FloatArray) -> tuple[list[Any], list[Any]]:
+        """Return x and y of the areas below values (K,), a closed one between two breaks.
+
+        A fill to zero would bridge the breaks.
+        """
+        x, y = [], []
+        for at in np.split(self._points, self._breaks):
+            if len(at):
+                x.append(np.concatenate([times[at], times[at[[-1, 0]]], [np.nan]]))
+                y.append(np.concatenate([values[at], [0.0, 0.0, np.nan]]))
+        return solids.numbers(np.concatenate(x), 6), solids.numbers(np.concatenate(y))
+
 
 # --- static part -------------------------------------------------------------------------------
 
@@ -150,10 +162,11 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
             "row": 2,
         }
         for column, std in ((1, found.position_std_m), (3, found.rotation_std_deg)):
+            x, y = curves.under(story.times, 3 * std)
             shown.add_scatter(
-                x=times,
-                y=solids.numbers(curves.of(3 * std)),
-                fill="tozeroy",
+                x=x,
+                y=y,
+                fill="toself",
                 fillcolor=_faint(belief.colour),
                 line={"width": 0},
                 name="3 sigma",

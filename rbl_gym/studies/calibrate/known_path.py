@@ -22,6 +22,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Truth, truth_at
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.settings import LinkSettings
+from rbl_gym.studies.frozen_truth import renewed
 
 # Range of tested time shifts, seconds.
 _SEARCH_S = 1.0
@@ -102,10 +103,7 @@ def _without_repeats(truth: Truth, longest_s: float) -> Truth:
     A tracker that loses its markers may repeat its last pose. The body moves on, so the poses
     between are interpolated. If the body rests, this changes little.
     """
-    values = truth.translation
-    if truth.rotation is not None:
-        values = np.column_stack([values, truth.rotation.reshape(-1, 9)])
-    new = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))
+    new = renewed(truth)
     since = truth.times[new]
     lasts_s = np.append(np.diff(since), np.inf)[np.cumsum(new) - 1]
     kept = new | (lasts_s > longest_s)

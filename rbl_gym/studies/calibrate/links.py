@@ -24,7 +24,9 @@ from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.directed import fit_log, with_directions
 from rbl_gym.studies.calibrate.files import write_directions, write_link_table, write_points
 from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_of, path_at
+from rbl_gym.studies.calibrate.outliers import few, outliers
 from rbl_gym.studies.calibrate.settings import LinkSettings
+from rbl_gym.studies.frozen_truth import frozen_notes
 
 __all__ = ["CalibratedLinks", "calibrate_links"]
 
@@ -172,7 +174,13 @@ def calibrate_links(
         fit = fit._replace(tags_std_m=np.where(told, np.hypot(fit.tags_std_m, found.spread_m), 0.0))
     _check_fit(fit)
     advance()
-    return _result(log, settings, model, fit, clock, shift, found)
+    result = _result(log, settings, model, fit, clock, shift, found)
+    result.figures["notes"] += [
+        f"Note: {f'run {name!r}: ' if name else ''}{note}."
+        for name, run in recordings.items()
+        for note in frozen_notes(run, shift, settings.truth_exclude)
+    ]
+    return result
 
 
 def _check_fit(fit: LinkFit) -> None:
@@ -226,8 +234,9 @@ def _result(
     anchor_ids, tag_ids = log.runs[0].anchor_ids, log.runs[0].tag_ids
     told = fit.counts > 0
     path, known = path_at(log, settings, shift)
-    distance = directions(log.anchors, carried_tags(path, fit.tags))[1]
-    distance = np.where(log.links & known[:, None, None], distance, np.nan)
+    away, distance = directions(log.anchors, carried_tags(path, fit.tags))
+    links = log.links & known[:, None, None]
+    distance = np.where(links, distance, np.nan)
     left = fit.residuals[log.links & (fit.residuals != 0)]
     figures: dict[str, Any] = {
         "ranges": int(fit.counts.sum()),
@@ -281,6 +290,8 @@ def _result(
         }
     elif model.tags == "free" and len(log.tags) > 1:
         figures["turn"] = _table_beside(log.tags, fit, settings.planar)
+    away = -away * distance[..., None]
+    figures |= outliers(log.ranges - distance, away, links, (anchor_ids, tag_ids), settings.planar)
     figures["not_determined"] = _untold(fit, model, settings, clock, (anchor_ids, tag_ids), found)
     if found is not None and settings.harmonics:
         figures["directions"] = {
@@ -322,14 +333,14 @@ def _untold(
     none = np.argwhere(fit.counts == 0)
     names = [f"{ids[0][m]}-{ids[1][n]}" for m, n in none]
     if names:
-        said.append(f"links without ranges: {_few(names)}")
+        said.append(f"links without ranges: {few(names)}")
     loose = np.argwhere((fit.counts > 0) & (fit.bias_std_m > _UNTOLD * BIAS_M))
     if len(loose):
-        said.append(f"bias of {_few([f'{ids[0][m]}-{ids[1][n]}' for m, n in loose])}")
+        said.append(f"bias of {few([f'{ids[0][m]}-{ids[1][n]}' for m, n in loose])}")
     loose = np.argwhere((fit.counts > 0) & (fit.slope_std > _UNTOLD * SLOPE))
     if model.slopes and len(loose):
         said.append(
-            f"slope of {_few([f'{ids[0][m]}-{ids[1][n]}' for m, n in loose])}: the distances vary "
+            f"slope of {few([f'{ids[0][m]}-{ids[1][n]}' for m, n in loose])}: the distances vary "
             "too little; bias and slope trade off"
         )
     if settings.time_offset == "auto" and clock is None:
@@ -352,7 +363,3 @@ def _untold(
         for n, i in np.argwhere(fit.tags_std_m > _UNTOLD * ARM_M):
             said.append(f"{axes[i]} of tag {ids[1][n]}")
     return said
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.anchor_faults import anchor_note
 from rbl_gym.studies.replay.causes import Cause, likely_causes
 from rbl_gym.studies.replay.consistency import (
     MOST_NIS,
@@ -30,7 +31,7 @@ def diagnose(
     figures = consistency_figures(found, recording)
     ratio = figures["nis_per_dof"]
     if not figures["contradicts"]:
-        notes = []
+        notes = anchor_note(recording, settings, track)
         if ratio < WIDE:
             notes.append(
                 f"{WIDE_NOTE} for this log (NIS per degree of freedom {ratio:.2f}, 1: consistent), "

@@ -10,6 +10,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import apply_alignment
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.frozen_truth import frozen_notes
 from rbl_gym.studies.replay.centre import is_line
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
@@ -224,6 +225,9 @@ def _notes(
         if outside:
             notes.append(f"Note: the track is outside the volume in {outside} of {count} epochs.")
     if found is not None:
+        told = settings.comparison
+        frozen = frozen_notes(recording, float(told.time_offset), told.truth_exclude)
+        notes += [f"Note: {note}." for note in frozen]
         notes += _floor_note(recording, settings)
         if _truth_at_mirror(recording, track, found, settings):
             notes.append("Note: the truth is at the mirror pose.")

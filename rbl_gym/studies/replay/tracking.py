@@ -51,6 +51,13 @@ _DIRECTED = ("iekf-log", "iekf-bias", "iekf-imu")
 _IMAGE_RAD, _IMAGE_M = 0.1, 0.2
 
 
+class LinkBiases(NamedTuple):
+    """Constant biases of the links after the last epoch: mean (M, N) and covariance (M N, M N)."""
+
+    mean_m: FloatArray
+    covariance: FloatArray
+
+
 class Track(NamedTuple):
     """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6).
 
@@ -58,6 +65,7 @@ class Track(NamedTuple):
     `innovations`: innovations of the ranges, arrays (K, ...). `nis` over `dof` is 1 on average if
     the filter is consistent. `at_centre`: covariances (K, 6, 6) with the errors of the centre of
     the tags in place of those of the origin, if this centre was tracked (`replay.centre`).
+    `biases`: None if the filter estimates no constant biases.
     """
 
     times: FloatArray
@@ -67,6 +75,7 @@ class Track(NamedTuple):
     other: Mirror | None = None
     innovations: Innovations | None = None
     at_centre: FloatArray | None = None
+    biases: LinkBiases | None = None
 
 
 def track_recording(recording: Recording, settings: Settings, advance: Advance = silent) -> Track:
@@ -86,17 +95,15 @@ def track_recording(recording: Recording, settings: Settings, advance: Advance =
 def _tracked(recording: Recording, settings: Settings, advance: Advance) -> Track:
     filter = recording_filter(recording, settings)
     steps = _counted(log_steps(recording, settings, filter), advance)
-    beliefs, found = zip(
-        *(
-            (group.belief, innovations)
-            for group, innovations in innovations_of(
-                filter, steps, recording.tags, _noise(settings)
-            )
-        ),
-        strict=True,
-    )
+    beliefs, found, state = [], [], None
+    for group, innovations in innovations_of(filter, steps, recording.tags, _noise(settings)):
+        # Only the last of the states are kept, as those of a long log fill the memory.
+        state = group.state
+        beliefs.append(group.belief)
+        found.append(innovations)
     belief, foretold = joined(beliefs), joined(found)
-    track = Track(recording.times, *belief[:3], innovations=foretold)
+    biases = _constant_biases(filter, state, recording.links.shape[1:])
+    track = Track(recording.times, *belief[:3], innovations=foretold, biases=biases)
     known = settings.knowledge
     if known.planar or known.height_std_m is not None or known.tilt_std_deg is not None:
         # Known height, roll and pitch distinguish the two sides.
@@ -110,6 +117,20 @@ def _tracked(recording: Recording, settings: Settings, advance: Advance) -> Trac
     if other is None:
         return track
     return track._replace(covariance=covering(other, poses), other=other)
+
+
+def _constant_biases(filter: Any, states: Any, shape: tuple[int, ...]) -> LinkBiases | None:
+    """Return the constant biases (M, N) of the last of some states; None: there are none."""
+    if hasattr(filter, "leader"):
+        filter, states = filter.filter, filter.leader(states)
+    links = math.prod(shape)
+    # The last states are the biases, law after law.
+    for k, law in enumerate(reversed(getattr(filter, "biases", ())), 1):
+        if law.time_s is None:
+            end = states.extra.shape[-1] - (k - 1) * links
+            mean, P = states.extra[-1, end - links : end], states.covariance[-1, 6:, 6:]
+            return LinkBiases(mean.reshape(shape), P[end - links : end, end - links : end].copy())
+    return None
 
 
 def _counted(steps: Iterator[Step | Steps], advance: Advance) -> Iterator[Step | Steps]:
