@@ -15,6 +15,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.estimators import IteratedEkf, PoseBelief, one_by_one
 from rbl_gym.testing import check_filter
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
+from tests import recorded
 from tests.test_tracking_vector_env import ID, short
 
 
@@ -148,6 +149,23 @@ def test_the_benchmark_names_the_loop_and_the_status_is_an_error(tmp_path, capsy
     rows = json.loads((tmp_path / "x.json").read_text())["rows"]
     for want, got in zip(rows[::2], rows[1::2], strict=True):
         np.testing.assert_allclose(got["tags_m"]["rmse"], want["tags_m"]["rmse"], rtol=1e-6)
+
+
+def test_a_replay_runs_the_loop(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    anchors = rng.uniform(-5, 5, (6, 3))
+    tags = np.array([[0.4, 0, 0], [-0.4, 0.3, 0], [0, -0.3, 0.5]])
+    ranges = np.linalg.norm(anchors[:, None] - tags, axis=-1)
+    ranges = ranges + 0.05 * rng.standard_normal((9, 6, 3))
+    files = recorded.files(tmp_path, anchors, tags, 0.1 * np.arange(9), ranges)
+    found = []
+    for name in ("tests.test_one_by_one:Batched", "iekf/iterations=1"):
+        args = ["--filter", name, "--range-std-m", "0.05", "--json"]
+        assert main(["replay", *recorded.options(files), *args, str(tmp_path / "f.json")]) == 0
+        found.append(json.loads((tmp_path / "f.json").read_text())["consistency"]["nis_per_dof"])
+    capsys.readouterr()
+    # The command makes the filter of the package robust.
+    assert found[0] == pytest.approx(found[1], rel=0.02)
 
 
 def test_an_error_that_one_body_also_has_stays_as_it_is():

@@ -339,3 +339,23 @@ def test_a_locator_is_as_deterministic_as_it_should_be():
     )
     with pytest.raises(AssertionError, match="a second call must give the same bytes"):
         check_locator(shaken, skip=[n for n in testing._LOCATOR_CHECKS if n != "determinism"])
+
+
+def test_states_that_commands_cannot_take_apart_are_named():
+    class Wrapped(estimators.IteratedEkf):
+        """Its state is a dict."""
+
+        def initial(self, *prior):
+            return {"state": super().initial(*prior)}
+
+        def predict(self, state, *args):
+            return {"state": super().predict(state["state"], *args)}
+
+        def update(self, state, *args, **options):
+            return {"state": super().update(state["state"], *args, **options)}
+
+        def belief(self, state):
+            return super().belief(state["state"])
+
+    with pytest.raises(AssertionError, match="got dict: commands"):
+        check_filter(Wrapped)

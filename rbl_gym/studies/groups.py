@@ -168,7 +168,7 @@ def _grouped(steps: Iterable[Step | Steps], noise: NoiseLaw) -> Iterator[Steps]:
 def _stacked(steps: list[Step], noise: NoiseLaw) -> Steps:
     columns: list[list[Any]] = [[step[part] for step in steps] for part in range(3)]
     predicted, state, belief = (
-        type(column[0])(*map(np.array, zip(*column, strict=True))) for column in columns
+        type(column[0])(*map(np.stack, zip(*column, strict=True))) for column in columns
     )
     readings = [step.reading for step in steps]
     ranges = np.array([reading.ranges for reading in readings])

@@ -72,13 +72,13 @@ def check_filter(
     Raises
     ------
     AssertionError
-        If a check fails. The checks are ``interface``, ``shapes`` (of beliefs, for no, one and two
-        leading axes), ``pose`` (proper rotations, covariances symmetric and positive definite),
-        ``batching`` (a batch gives the same as a loop), ``purity`` (arguments and states are never
-        changed), ``determinism``, ``pickling``, ``invariance`` (to translation and rotation of the
-        world), ``links`` (a missing link has no weight), ``noise`` (the noise law of an epoch is an
-        argument of `update`, only for that epoch), ``nan`` (raises ValueError), ``nees`` (the
-        belief is consistent and better than the prior).
+        If a check fails. The checks are ``interface``, ``shapes`` (of beliefs and states, for no,
+        one and two leading axes), ``pose`` (proper rotations, covariances symmetric and positive
+        definite), ``batching`` (a batch gives the same as a loop), ``purity`` (arguments and states
+        are never changed), ``determinism``, ``pickling``, ``invariance`` (to translation and
+        rotation of the world), ``links`` (a missing link has no weight), ``noise`` (the noise law
+        of an epoch is an argument of `update`, only for that epoch), ``nan`` (raises ValueError),
+        ``nees`` (the belief is consistent and better than the prior).
     """
     _try_all(_FILTER_CHECKS, factory_of(make_filter), skip, seed)
 
@@ -135,6 +135,15 @@ def _filter_shapes(make_filter: Any, rng: np.random.Generator) -> None:
         with batched(batch):
             belief = _beliefs(filter, _drawn(filter, rng, batch, 2))[-1]
             check_shapes("belief", belief, batch)
+            state = call("initial", filter.initial, *_drawn(filter, rng, batch, 1).prior)
+            whole = isinstance(state, tuple) and hasattr(state, "_fields")
+            require(
+                # Of one body alone any state will do until the beliefs of a batch were checked.
+                not batch
+                or (whole and all(np.shape(field)[: len(batch)] == batch for field in state)),
+                "a state must be a NamedTuple of arrays whose leading axes are those of the prior, "
+                f"got {type(state).__name__}: commands and vector environments take it apart",
+            )
 
 
 def _filter_pose(make_filter: Any, rng: np.random.Generator) -> None:
