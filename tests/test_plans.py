@@ -257,6 +257,13 @@ def test_open_lines_on_a_layer_of_areas_are_counted():
     assert "layer Z, read as zones: 1 lines that enclose no area were left out" in made.said
 
 
+def test_what_a_zone_is_asked_holds_for_the_whole_plan_if_the_layer_has_no_area():
+    wall, line = square(0, 0, 9, "walls"), np.array([[0.0, 0.0], [3.0, 0.0]])
+    found = plan_of(wall, drawing.Shape("Z", "LINE", line))
+    (zone,) = layers.building(found, uses("zones Z,attitude=level,low_m=0.2")).tables["zones"]
+    assert (zone["name"], zone["attitude"], zone["low_m"]) == ("plan", "level", 0.2)
+
+
 def test_mounts_on_a_ring_look_inwards_those_on_a_line_both_ways():
     wall = drawing.Shape("M", "LINE", np.array([[0.0, 0.0], [4.0, 0.0]]))
     clockwise = square(0, 2, 4, "M")

@@ -100,7 +100,7 @@ def building(
             "LAYER, --mounts LAYER"
         )
     made.said += _not_used(drawing, made.used)
-    made.complete()
+    made.complete(next((use.values for use in uses if use.kind == "zones"), {}))
     return Building(made.tables(n_anchors), made.used, made.said)
 
 
@@ -295,8 +295,8 @@ class _Maker:
 
     # --- the whole -------------------------------------------------------------------------------
 
-    def complete(self) -> None:
-        """Add default mounts and a default zone if no layer has them."""
+    def complete(self, asked: dict[str, Any]) -> None:
+        """Add default mounts and a default zone if no layer has them; `asked`: keys of a zone."""
         top = rounded(self.height - _BELOW_CEILING_M)
         if not self.found["mounts"]:
             low = min(_MOUNT_LOW_M, 0.7 * self.height)
@@ -335,6 +335,7 @@ class _Maker:
                     "name": "plan",
                     "low_m": ZONE_M[0],
                     "high_m": ZONE_M[1],
+                    **asked,
                 }
             ]
 
