@@ -40,7 +40,7 @@ def outliers(
     if far:
         named = [f"{row['anchor']}-{row['tag']} by {row['offset_m']:+.2f} m" for row in far]
         notes.append(
-            f"WARNING: the ranges of some links differ by more than {MOST_OFF_M:g} m from those of "
+            f"WARNING: the errors of some links differ by more than {MOST_OFF_M:g} m from those of "
             f"the others: {few(named)}."
         )
     for row in wrong:
