@@ -1,8 +1,6 @@
 # make demo: everything from nothing to a table, a picture and a page.  make test: the whole suite.
 PYTHON ?= python3
 BIN := .venv/bin
-# Of the checker of types: two need less time than one, but more of it in all.
-THREADS = 2
 
 .PHONY: demo test test-long coverage benchmarks lint format copy types docs wheel dist clean
 
@@ -42,7 +40,7 @@ copy: .venv/dev.stamp
 
 types: copy
 	cp -r tests pyproject.toml build/copy/
-	cd build/copy && ../../$(BIN)/pyright --threads $(THREADS) --pythonpath ../../$(BIN)/python
+	cd build/copy && ../../$(BIN)/pyrefly check --python-interpreter-path ../../$(BIN)/python
 
 # The site, in build/site; its reference is read from the copy.
 docs: copy

@@ -66,7 +66,7 @@ def run(name: str, seconds: int) -> tuple[dict[str, object], str]:
 
 
 def fuzz(name: str, seconds: int) -> None:
-    import atheris  # pyright: ignore[reportMissingImports]
+    import atheris
 
     with atheris.instrument_imports(include=INSTRUMENTED):
         from tests.fuzz_files import READERS, check

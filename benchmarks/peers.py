@@ -388,7 +388,7 @@ def against_gtsam(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
         ]
 
     everything = slice(None)
-    exact = replace(epochs.filter, iterations=30)  # pyright: ignore[reportArgumentType]
+    exact = replace(epochs.filter, iterations=30)
     cls = estimators.locate(epochs.ranges, epochs.anchors, epochs.tags, RANGES, "cls")
     return [
         *duels(

@@ -91,7 +91,7 @@ def tracks(offset: str | None, trials: int, seed: int) -> dict[str, list[float]]
     told = monte_carlo.told_readings(scene, few.episode, few.measurements)
     episode = few.episode
     times = np.cumsum([reading.dt for reading in told])
-    twists = np.stack([reading.twist for reading in told[1:]], axis=1)  # pyright: ignore
+    twists = np.stack([reading.twist for reading in told[1:]], axis=1)
     ranges = np.stack([reading.ranges for reading in told], axis=1)
     log = smoothing.RangeLog(times, ranges, episode.anchors[:, None])
     prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance

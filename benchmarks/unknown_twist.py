@@ -102,7 +102,7 @@ def drawn(sensor: ut.TwistSensor | None, options: argparse.Namespace) -> dict[st
         ranges = ranging.simulate(anchors, tags, *pose, SCENE.noise, rng).ranges
         begin = time.process_time()
         if k:
-            state = filter.predict(state, reading, SCENE.dt)  # pyright: ignore[reportArgumentType]
+            state = filter.predict(state, reading, SCENE.dt)
         state = filter.update(state, ranges, anchors)
         seconds += time.process_time() - begin
         error = metrics.pose_error(state.rotation, state.translation, *pose)

@@ -201,7 +201,7 @@ class Asynchronous:
         kept = [point for point in stream.checkpoints if point.time <= time]
         later = [point.measured for point in stream.checkpoints[len(kept) :]]
         for each in (measured, *later):
-            kept.append(self._advanced(kept[-1], each))  # pyright: ignore[reportArgumentType]
+            kept.append(self._advanced(kept[-1], each))  # pyrefly: ignore[bad-argument-type]
         # A range at the window's edge starts from the last checkpoint at or before the edge.
         first = max(
             k for k, point in enumerate(kept) if k == 0 or point.time < newest - self.window_s
@@ -224,7 +224,7 @@ class Asynchronous:
     def _moved(self, point: Checkpoint, time: float, twist: FloatArray | None) -> Any:
         if time == point.time:
             return point.state
-        return self.filter.predict(point.state, twist, time - point.time)  # pyright: ignore[reportArgumentType]
+        return self.filter.predict(point.state, twist, time - point.time)  # pyrefly: ignore[bad-argument-type]
 
     def state(
         self, stream: Stream, time: float | None = None, twist: ArrayLike | None = (0.0,) * 6

@@ -229,7 +229,7 @@ def _states(
     """Return pose, other states x, covariance P of both, derivative (M N, K) of ranges by x."""
     if hasattr(filter, "leader"):
         # Of several hypotheses, use the prediction of the most likely.
-        filter, state = filter.filter, filter.leader(state)  # pyright: ignore[reportAttributeAccessIssue]
+        filter, state = filter.filter, filter.leader(state)  # pyrefly: ignore[missing-attribute]
     own = getattr(filter, "biases_of", None)
     if own is not None:
         return (state.rotation, state.translation), *own(state, anchors)

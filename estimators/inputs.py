@@ -44,7 +44,7 @@ def check_prior(
     """
     if _is_plain_prior(rotation, translation, covariance, sizes):
         # Fast path for one body. Invalid input takes the slow path, which names the error.
-        return rotation, translation, covariance  # pyright: ignore[reportReturnType]
+        return rotation, translation, covariance  # pyrefly: ignore[bad-return]
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     return rotation, translation, check_covariance(covariance, sizes)
@@ -123,11 +123,11 @@ def check_epoch(
         links is None
         and not signed
         and links_of_plain_epoch(ranges, anchors, tags, ()) is not None
-        and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportCallIssue, reportArgumentType]
-        and are_positive(ranges)  # pyright: ignore[reportArgumentType]
+        and np.vdot(anchors, anchors) < HUGE  # pyrefly: ignore[no-matching-overload]
+        and are_positive(ranges)  # pyrefly: ignore[bad-argument-type]
     ):
         # Fast path for one body. Invalid input takes the slow path, which names the error.
-        return ranges, anchors, None  # pyright: ignore[reportReturnType]
+        return ranges, anchors, None  # pyrefly: ignore[bad-return]
     anchors = check_array("anchors", anchors, ("M", 3))
     shape = (anchors.shape[-2], tags.shape[-2])
     mask = check_links(links, shape)

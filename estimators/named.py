@@ -97,7 +97,7 @@ def iekf_cv(
         As in `TwistSensor`; the twist passed to `predict` is then a measurement. Both None: it is
         ignored.
     """
-    law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
+    law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyrefly: ignore[bad-argument-type]
     sensor = TwistSensor(gyro_std_rad_s, speed_std_m_s, frame)
     measured = gyro_std_rad_s is not None or speed_std_m_s is not None
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
@@ -183,7 +183,7 @@ def iekf_log(
     directions
         As in `AugmentedEkf`.
     """
-    law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
+    law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyrefly: ignore[bad-argument-type]
     stays = LinkBias(constant_std_m, None, constant_common_m)
     moves = LinkBias(drift_std_m, drift_time_s)
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
@@ -208,7 +208,8 @@ def iekf_log(
         # A bias with zero standard deviation needs no states.
         biases = tuple(bias for bias in (stays, moves) if bias.std_m or bias.common_std_m)
         filter = OdometryEkf(pose, law, None, biases, directions, sensor)
-    return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
+    found = filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
+    return found  # pyrefly: ignore[bad-return]
 
 
 register("iekf", iekf)

@@ -54,11 +54,11 @@ def checked(**shapes: tuple[int | str, ...]) -> Callable[[Callable[P, R]], Calla
                 held, key = (values, place) if place < len(values) else (kwargs, name)
                 if held is kwargs and name not in kwargs:
                     continue
-                if not (optional and held[key] is None):  # pyright: ignore[reportArgumentType, reportCallIssue]
-                    held[key] = check_array(name, held[key], shape)  # pyright: ignore
-            return function(*values, **kwargs)  # pyright: ignore[reportCallIssue]
+                if not (optional and held[key] is None):  # pyrefly: ignore[bad-index]
+                    held[key] = check_array(name, held[key], shape)  # pyrefly: ignore[bad-argument-type, bad-index, unsupported-operation]
+            return function(*values, **kwargs)  # pyrefly: ignore[invalid-param-spec]
 
-        door.kernel = function  # pyright: ignore[reportAttributeAccessIssue]
+        door.kernel = function  # pyrefly: ignore[missing-attribute]
         return door
 
     return decorate
@@ -66,7 +66,7 @@ def checked(**shapes: tuple[int | str, ...]) -> Callable[[Callable[P, R]], Calla
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function inside `checked`, for callers with checked arguments."""
-    return function.kernel  # pyright: ignore[reportFunctionMemberAccess]
+    return function.kernel  # pyrefly: ignore[missing-attribute]
 
 
 def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:

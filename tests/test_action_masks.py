@@ -81,7 +81,7 @@ def test_what_has_no_masks_says_so():
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0")
     env.reset(seed=1)
     with pytest.raises(ValueError, match="mode must be 'subset' or 'priced' for action masks"):
-        env.unwrapped.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
+        env.unwrapped.action_masks()  # pyrefly: ignore[missing-attribute]
     with pytest.raises(gym.error.ResetNeeded):
         made("priced").unwrapped.action_masks()
     many = {"scene": {"name": "hall", "n_anchors": 40}, "mode": "subset", "k": 8}
@@ -95,7 +95,7 @@ def test_what_has_no_masks_says_so():
 @pytest.mark.parametrize("kind", ["subset", "priced", "drawn mounts"])
 @pytest.mark.parametrize("vector", [False, True])
 def test_maskable_ppo_trains_and_honours_the_masks(kind, vector):
-    from sb3_contrib import MaskablePPO  # pyright: ignore[reportMissingImports]
+    from sb3_contrib import MaskablePPO
 
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 

@@ -418,7 +418,7 @@ def of_arrays(torch, tokens):
 
 @needs("torch")
 def test_the_played_network_is_that_of_torch():
-    import torch  # pyright: ignore[reportMissingImports]
+    import torch
 
     from rbl_gym.studies.learning.torch_layouts import Network
 
@@ -436,7 +436,7 @@ def test_the_played_network_is_that_of_torch():
 @needs("torch")
 @pytest.mark.parametrize("family", ["boxes", "shells", "rooms"])
 def test_the_loss_of_the_training_is_the_score(family):
-    import torch  # pyright: ignore[reportMissingImports]
+    import torch
 
     from rbl_gym.studies.learning import torch_layouts
     from rbl_gym.studies.learning.amortised import case_of

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,9 +151,10 @@ def test_their_own_times_are_worth_more_than_one_stamp_for_all():
     ],
 )
 def test_a_range_that_cannot_be_is_refused(change, message):
+    told: dict[str, Any] = {"time": 1.0, "anchor": 0, "tag": 0, "range": 1.0, **change}
     links, stream, _ = stream_of("iekf", np.random.default_rng(5))
     with pytest.raises(ValueError, match=message):
-        links.add(stream, **{"time": 1.0, "anchor": 0, "tag": 0, "range": 1.0, **change})
+        links.add(stream, **told)
 
 
 def test_a_stream_that_cannot_be_is_refused():
@@ -167,7 +169,7 @@ def test_a_stream_that_cannot_be_is_refused():
     with pytest.raises(ValueError, match="n_tags must be"):
         Asynchronous(links.filter, links.anchors, 0)
     with pytest.raises(ValueError, match="n_tags must be a positive int, got '4'"):
-        Asynchronous(links.filter, links.anchors, "4")  # pyright: ignore[reportArgumentType]
+        Asynchronous(links.filter, links.anchors, "4")  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize("name", ["kf", "uc-kf", "et-kf", "kf-ortho"])

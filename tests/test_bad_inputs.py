@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -96,7 +98,7 @@ def test_priors(name, changes, message):
 )
 def test_epochs(name, changes, message):
     filter = make(name)
-    epoch = {"ranges": RANGES, "anchors": ANCHORS, **changes}
+    epoch: dict[str, Any] = {"ranges": RANGES, "anchors": ANCHORS, **changes}
     with pytest.raises(ValueError, match=message):
         filter.update(filter.initial(**GOOD_PRIOR), **epoch)
 

@@ -1,7 +1,8 @@
 """The bank of iterated EKFs: unknown start, mirror poses, recovery of a lost track."""
 
-# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ VAGUE = np.diag([np.pi**2] * 3 + [400.0] * 3)
 FAR = 70.0
 
 
-def make(tags=TAGS, name="iekf-bank", **options):
+def make(tags=TAGS, name="iekf-bank", **options) -> Any:
     return estimators.make(name, tags=tags, noise=NOISE, process=PROCESS, **options)
 
 
@@ -54,7 +55,7 @@ def near(world, trace):
 @pytest.mark.parametrize("robust", [False, True])
 def test_without_a_doubt_it_is_the_iterated_ekf(robust):
     here = world("uwb_room", 1, 20, nlos_probability=0.1 if robust else 0.0)
-    filters = [
+    filters: list[Any] = [
         monte_carlo.scene_filter(here.scene, name, {"robust": robust})
         for name in ("iekf", "iekf-bank")
     ]

@@ -126,7 +126,7 @@ def test_bad_angles_are_refused(value, message):
     with pytest.raises(ValueError, match="std_rad must be"):
         bearing.AngleNoise(0.0)
     with pytest.raises(ValueError, match="noise must be a bearing"):
-        doa.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)  # pyright: ignore[reportArgumentType]
+        doa.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize("scale", [1e-45, 1e-3, 1e9, 1e120, 1e150, 1e300])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from rbl_gym.estimators import filter as belief
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
 
-LAWS = {
+LAWS: dict[str, Any] = {
     "tags": bodies.pyramid(),
     "noise": ranging.RangeNoise(0.1),
     "process": motion.ProcessNoise(0.1, 0.1),

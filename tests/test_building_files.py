@@ -26,7 +26,7 @@ from tests.helpers import ROOT, changed_tables, needs
 OFFICE = tomllib.loads((ROOT / "examples" / "office.toml").read_text(encoding="utf-8"))
 SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4]]
 # A hall without walls, whose anchors stand in a box: needs no shapely.
-HALL = {
+HALL: dict[str, Any] = {
     "anchors": {"kind": "box", "low": [0, 0, 2], "high": [10, 8, 3], "number": 4},
     "zones": [{"low": [1, 1, 0], "high": [9, 7, 2], "position_m": 0.2}],
     "body": {"shape": "pyramid", "size_m": 0.5},

@@ -109,6 +109,6 @@ def test_a_heading_of_the_truth_names_the_option(tmp_path):
 
 def test_a_format_as_the_second_argument_is_refused():
     with pytest.raises(TypeError, match=r"run must be .* give the format by name"):
-        read_recording(Files(**FILES), Format())  # type: ignore[arg-type]
+        read_recording(Files(**FILES), Format())  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(TypeError, match=r"format must be recordings.Format"):
-        read_recording(Files(**FILES), format={})  # type: ignore[arg-type]
+        read_recording(Files(**FILES), format={})  # pyrefly: ignore[bad-argument-type]

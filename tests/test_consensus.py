@@ -1,8 +1,8 @@
 """Cycle consensus: the ring, the iteration (14), its factor, its limit in any order."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -217,6 +217,7 @@ def test_sparse_eigenvalues_agree_with_dense_ones(monkeypatch):
 def test_history_begins_with_y_and_lost_messages_do_nothing():
     edges, y, n_nodes = next(networks(1))
     run = cycle_iteration(edges, y, n_nodes, history=True)
+    assert run.history is not None
     assert run.history.shape == (run.steps + 1, len(edges))
     np.testing.assert_array_equal(run.history[0], y)
     np.testing.assert_array_equal(run.history[-1], run.psi)
@@ -276,7 +277,8 @@ def test_an_edge_that_comes_twice_was_measured_twice():
     ],
 )
 def test_wrong_arguments_are_named(change, message):
-    arguments = {"edges": [[0, 1], [1, 2], [0, 2]], "y": [0.1, 0.2, 0.3], "n_nodes": 3, **change}
+    triangle = {"edges": [[0, 1], [1, 2], [0, 2]], "y": [0.1, 0.2, 0.3], "n_nodes": 3}
+    arguments: dict[str, Any] = {**triangle, **change}
     with pytest.raises(ValueError, match=message):
         cycle_iteration(**arguments)
 
@@ -291,7 +293,7 @@ def test_wrong_arguments_are_named(change, message):
 )
 def test_wrong_arguments_of_the_projection_are_named(y, branch, message):
     with pytest.raises(ValueError, match=message):
-        cycle_projection(np.array([[1.0, 1.0, -1.0]]), y, branch)  # pyright: ignore[reportArgumentType]
+        cycle_projection(np.array([[1.0, 1.0, -1.0]]), y, branch)
 
 
 @pytest.mark.parametrize("trials", [200, pytest.param(1000, marks=pytest.mark.long)])

@@ -161,7 +161,8 @@ def test_what_does_not_go_with_differences_is_refused(tmp_path, change, message)
     if "calibration" in change:
         change = {"calibration": table(tmp_path / "c.csv", "anchor,tag,bias_m", [[0, 0, 0.1]])}
     format = recordings.Format(offset=change.pop("offset", None))
-    files = recordings.Files(path, **{**tables(tmp_path), **change})
+    told: dict[str, Any] = {**tables(tmp_path), **change}
+    files = recordings.Files(path, **told)
     with pytest.raises(ValueError, match=message):
         recordings.read_recording(files, format=format)
 

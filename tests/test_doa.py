@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -307,6 +309,6 @@ def test_derivatives_of_the_costs_by_finite_differences():
     ],
 )
 def test_bad_input_is_named(changes, message):
-    arguments = {"angles": np.ones((2, 4)), "tags": TAGS, **changes}
+    arguments: dict[str, Any] = {"angles": np.ones((2, 4)), "tags": TAGS, **changes}
     with pytest.raises(ValueError, match=message):
         estimators.locate_doa(**arguments)

@@ -244,7 +244,7 @@ def exact_posterior(P: Any, matrix: Any):
     for prior, told in zip(P.astype(np.longdouble), matrix.astype(np.longdouble), strict=True):
         rows = np.concatenate([np.eye(12) + prior @ told, prior], axis=1)
         for i in range(12):
-            best = i + np.argmax(np.abs(rows[i:, i]))
+            best = i + int(np.argmax(np.abs(rows[i:, i])))
             rows[[i, best]] = rows[[best, i]]
             rows[i] /= rows[i, i]
             others = np.arange(12) != i

@@ -101,4 +101,4 @@ def test_options_that_nobody_knows_are_refused(name):
         with pytest.raises(ValueError, match=r"options m.*got 'nonsense'"):
             made.reset(seed=0, options={"nonsense": 1})
         with pytest.raises(ValueError, match="options must be a dict or None, got 3"):
-            made.reset(seed=0, options=3)  # pyright: ignore[reportArgumentType]
+            made.reset(seed=0, options=3)  # pyrefly: ignore[bad-argument-type]

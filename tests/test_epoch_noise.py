@@ -41,7 +41,7 @@ class Delegate:
 
 
 class OldInterface(Delegate):
-    def update(self, state, ranges, anchors, links=None):
+    def update(self, state, ranges, anchors, links=None):  # pyrefly: ignore[bad-override]
         return self._inner.update(state, ranges, anchors, links)
 
 
@@ -139,7 +139,7 @@ def test_a_noise_that_is_no_law_is_refused(name):
     anchors = 9.0 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     ranges = ranging.distances(anchors, TAGS)
     with pytest.raises(ValueError, match=r"noise must be a noise law .* got 0.1"):
-        filter.update(state, ranges, anchors, noise=0.1)  # pyright: ignore[reportArgumentType]
+        filter.update(state, ranges, anchors, noise=0.1)  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match=r"noise must fit ranges of shape \(4, 6\)"):
         filter.update(state, ranges, anchors, noise=ranging.LinkNoise(np.ones((3, 6))))
 
@@ -173,7 +173,7 @@ def test_angles_take_the_laws_of_their_epoch():
     noise, range_noise = laws[1]
     told: Any = filters[0]
     got = told.update(state, angles, station, noise=noise, ranges=ranges, range_noise=range_noise)
-    want = filters[1].update(state, angles, station, ranges=ranges)  # pyright: ignore[reportCallIssue]
+    want = filters[1].update(state, angles, station, ranges=ranges)  # pyrefly: ignore[bad-keyword-argument]
     np.testing.assert_array_equal(got.covariance, want.covariance)
     with pytest.raises(ValueError, match=r"noise must be a bearing.AngleNoise, or None, got Range"):
         told.update(state, angles, station, noise=range_noise)
@@ -205,10 +205,10 @@ def test_options_of_a_filter_by_name_and_by_settings_give_the_same_track():
     same = replay.track_recording(log(0.02), replay.Settings.of(filter="iekf", robust="late"))
     np.testing.assert_array_equal(told.translation, same.translation)
     once = replay.Settings.of(filter="iekf/iterations=1")
-    assert replay.recording_filter(log(0.02), once).iterations == 1  # pyright: ignore[reportAttributeAccessIssue]
+    assert replay.recording_filter(log(0.02), once).iterations == 1  # pyrefly: ignore[missing-attribute]
     assert once.changed(filter="iekf-cv").filter_options == ()
     supposed = replay.Settings.of(filter="iekf/robust=false").changed(robust=True)
-    assert replay.recording_filter(log(0.02), supposed).robust is True  # pyright: ignore[reportAttributeAccessIssue]
+    assert replay.recording_filter(log(0.02), supposed).robust is True  # pyrefly: ignore[missing-attribute]
     with pytest.raises(ValueError, match="'kf' has no option 'robust'"):
         replay.check_replay(log(0.02), replay.Settings.of(filter="kf/robust=true"))
     with pytest.raises(ValueError, match="robust is given twice"):

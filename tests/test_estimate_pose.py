@@ -80,7 +80,7 @@ def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options
         if "quality" in seen:
             variance = world.scene.noise.variance(seen["ranges"])
             noise = LinkNoise(np.sqrt(variance / seen["quality"][:, None]))
-            hand = dataclasses.replace(hand, noise=noise)  # pyright: ignore[reportArgumentType]
+            hand = dataclasses.replace(hand, noise=noise)  # pyrefly: ignore[bad-specialization]
         state = hand.update(state, seen["ranges"], seen["anchors"], seen["links"])
         belief = hand.belief(state)
         b = score_by_hand(belief.covariance, belief.rotation, tags)

@@ -187,7 +187,7 @@ def test_an_episode_equals_that_of_its_scene_alone():
     for seed in range(12):
         env = gym.make(ID, scenes=MIXED)
         results = episode(env, seed)
-        scene = env.unwrapped.scene  # pyright: ignore[reportAttributeAccessIssue]
+        scene = env.unwrapped.scene  # pyrefly: ignore[missing-attribute]
         seen.add(scene.name)
         alone = TrackingEnv(scene)
         generator, _ = seeding.np_random(seed)
@@ -227,7 +227,7 @@ def test_filters_run_in_drawn_worlds_and_are_honest(observation):
 def test_a_filter_has_no_more_than_the_scene_alone():
     env = EstimatePose(gym.make(ID, scenes=MIXED, reward="none"))
     results = episode(env, 3)
-    scene = env.unwrapped.scene  # pyright: ignore[reportAttributeAccessIssue]
+    scene = env.unwrapped.scene  # pyrefly: ignore[missing-attribute]
     plain = EstimatePose(TrackingEnv(scene, "none"))
     filter = plain._filter
     info = results[0][-1]
@@ -249,7 +249,7 @@ def test_masks_stand_at_the_end_of_a_flat_observation():
     env = EstimatePose(gym.make(ID, scenes=MIXED, reward="none"), observation="flat")
     for seed in range(6):
         flat, _ = env.reset(seed=seed)
-        m = env.unwrapped.scene.n_anchors  # pyright: ignore[reportAttributeAccessIssue]
+        m = env.unwrapped.scene.n_anchors  # pyrefly: ignore[missing-attribute]
         np.testing.assert_array_equal(flat[-12:], np.arange(12) < m)
         # Relative places and distances of anchors that are not there.
         assert not flat[21 + 3 * m : 21 + 36].any()

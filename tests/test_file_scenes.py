@@ -231,7 +231,7 @@ def test_a_file_that_changed_is_read_again(floor):
 def test_the_office_of_the_examples():
     env = gym.make("rbl_gym:RBL/Tracking-v0", scene=str(ROOT / "examples" / "office.toml"))
     check_env(env.unwrapped, skip_render_check=True)
-    assert env.unwrapped.scene.n_anchors == 8  # pyright: ignore[reportAttributeAccessIssue]
+    assert env.unwrapped.scene.n_anchors == 8  # pyrefly: ignore[missing-attribute]
 
 
 # --- errors -----------------------------------------------------------------------------------
@@ -315,12 +315,12 @@ def test_a_scene_file_is_the_scene_of_its_overrides(tmp_path):
         assert env.unwrapped.scene == made
     path.write_text(json.dumps({"name": "auv_craft", "steps": 4}))
     for text in (str(path), {"name": str(path)}):
-        env = gym.make("rbl_gym:RBL/MobileAnchors-v0", scene=text, difficulty="hard")
-        assert (env.unwrapped.scene.n_anchors, env.unwrapped.scene.steps) == (2, 4)
+        craft: Any = gym.make("rbl_gym:RBL/MobileAnchors-v0", scene=text, difficulty="hard")
+        assert (craft.unwrapped.scene.n_anchors, craft.unwrapped.scene.steps) == (2, 4)
     path.write_text(json.dumps(ROOM))
-    env = gym.make("rbl_gym:RBL/Tracking-v0", scenes=[str(path), str(path)])
-    env.reset(seed=1)
-    assert env.unwrapped.scene.name == "my room"
+    drawn: Any = gym.make("rbl_gym:RBL/Tracking-v0", scenes=[str(path), str(path)])
+    drawn.reset(seed=1)
+    assert drawn.unwrapped.scene.name == "my room"
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def error_by_hand(task, context, anchors, filter_of):
 def test_the_last_anchor_is_paid_by_a_plain_loop_over_tracks(kind):
     arguments = arguments_of(kind)
     env = anchor_placement(**arguments)
-    task = env.unwrapped.task  # pyright: ignore[reportAttributeAccessIssue]
+    task = env.unwrapped.task  # pyrefly: ignore[missing-attribute]
     *steps, last = episode(env, 3)
     assert not any(step[1] for step in steps[1:])
     assert not any(step[-1]["tag_error_m"] for step in steps)
@@ -184,7 +184,7 @@ def test_other_environments_are_refused():
 
 
 def test_the_bound_is_the_default_and_the_environment_is_the_bare_one():
-    assert type(gym.make(ID).env.env) is AnchorPlacementEnv  # pyright: ignore[reportAttributeAccessIssue]
+    assert type(gym.make(ID).env.env) is AnchorPlacementEnv  # pyrefly: ignore[missing-attribute]
 
 
 def test_frames_can_be_made():

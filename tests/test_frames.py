@@ -1,8 +1,8 @@
 """Frames of planar networks: exact data, the bound, ranges beside bearings, wrong input."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,13 +43,14 @@ def network():
 def test_exact_bearings_and_one_length_give_the_truth(network):
     positions, theta, edges = network
     bearings = true_bearings(positions, theta, edges)
-    for pair in (edges[3], edges[-1], [0, 13]):
-        length = np.linalg.norm(positions[pair[1]] - positions[pair[0]])
-        found = frames(edges, bearings, 14, tuple(pair), length)
+    pair, length = (0, 0), 0.0
+    for i, j in (edges[3], edges[-1], [0, 13]):
+        pair, length = (i, j), float(np.linalg.norm(positions[j] - positions[i]))
+        found = frames(edges, bearings, 14, pair, length)
         assert found.converged
         np.testing.assert_allclose(found.positions, positions, atol=1e-8)
         np.testing.assert_allclose(proj(found.orientations - theta), 0, atol=1e-9)
-    twice = frames(edges, bearings, 14, tuple(pair), 2 * length)
+    twice = frames(edges, bearings, 14, pair, 2 * length)
     np.testing.assert_allclose(twice.positions, 2 * positions, atol=1e-8)
 
 
@@ -79,7 +80,7 @@ def test_errors_reach_the_bound_and_ranges_lower_it(network, trials):
     positions, theta, edges = network
     sigma, range_std = 0.01, 0.02
     pair = (int(edges[3, 0]), int(edges[3, 1]))
-    known = np.linalg.norm(positions[pair[1]] - positions[pair[0]])
+    known = float(np.linalg.norm(positions[pair[1]] - positions[pair[0]]))
     exact = lengths(positions, edges)
     rng = np.random.default_rng(4)
     errors = {"known": [], "ranged": []}
@@ -150,7 +151,7 @@ def test_one_node_and_two():
     assert alone.positions.tolist() == [[0, 0]]
     pair = frames([[0, 1]], [[0.5, -2.0]], 2, (0, 1), 3.0)
     np.testing.assert_allclose(pair.positions[1], 3 * np.array([np.cos(0.5), np.sin(0.5)]))
-    np.testing.assert_allclose(pair.orientations, [0, proj(0.5 + 2.0 + np.pi)])
+    np.testing.assert_allclose(pair.orientations, [0, float(proj(0.5 + 2.0 + np.pi))])
 
 
 @pytest.mark.parametrize(
@@ -174,7 +175,7 @@ def test_one_node_and_two():
     ],
 )
 def test_wrong_arguments_are_named(change, message):
-    arguments = {
+    arguments: dict[str, Any] = {
         "edges": [[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]],
         "bearings": np.zeros((5, 2)),
         "n_nodes": 4,

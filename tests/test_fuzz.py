@@ -124,7 +124,7 @@ def spoilt(draw: st.DrawFn, good: np.ndarray) -> Any:
 )
 def test_spoilt_arrays(name, argument):
     @settings(max_examples=EXAMPLES, database=None, phases=[Phase.generate],
-              suppress_health_check=[*HealthCheck])  # pyright: ignore[reportArgumentType]  # fmt: skip
+              suppress_health_check=[*HealthCheck])  # fmt: skip
     @given(spoilt(CASES[name][1][argument]))
     def run(value: Any) -> None:
         check(name, argument, value)

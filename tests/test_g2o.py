@@ -1,8 +1,8 @@
 """Reading planar graphs: g2o and CSV, and what is wrong in them."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def written(tmp_path):
 
 
 def test_g2o(written):
-    graph = g2o.read_graph(written(G2O, "graph.G2O"))
+    graph: Any = g2o.read_graph(written(G2O, "graph.G2O"))
     assert graph.ids.tolist() == [10, 12, 40]
     assert graph.edges.tolist() == [[0, 1], [1, 2]]
     np.testing.assert_allclose(graph.y, [0.5, 7.0 - 2 * np.pi])
@@ -48,13 +48,13 @@ def test_csv_in_all_its_forms(written):
     bearings = g2o.read_graph(written("i,j,a,b\n0,1,0.5,-2.0\n"))
     np.testing.assert_allclose(bearings.y, [0.5 + 2.0 + np.pi - 2 * np.pi])
     full = "i,j,dx,dy,dtheta,I11,I12,I13,I22,I23,I33\n0,1,1,2,3,1,2,3,4,5,6\n"
-    assert g2o.read_graph(written(full)).information[0].tolist() == [[1, 2, 3], [2, 4, 5],
-                                                                     [3, 5, 6]]  # fmt: skip
+    whole: Any = g2o.read_graph(written(full))
+    assert whole.information[0].tolist() == [[1, 2, 3], [2, 4, 5], [3, 5, 6]]
 
 
 def test_edges_without_information(written):
     mixed = "EDGE_SE2 0 1 1 0 .1\nEDGE_SE2 1 2 1 0 .1 9 0 0 8 0 7\n"
-    graph = g2o.read_graph(written(mixed, "a.g2o"))
+    graph: Any = g2o.read_graph(written(mixed, "a.g2o"))
     assert np.isnan(graph.information[0]).all()
     np.testing.assert_array_equal(graph.information[1], np.diag([9, 8, 7]))
     assert g2o.read_graph(written("EDGE_SE2 0 1 1 0 .1\n", "b.g2o")).information is None

@@ -1,6 +1,5 @@
 """rbl-gym reproduce hard, a part of it, run in this process."""
 
-# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import dataclasses

@@ -123,6 +123,6 @@ def test_it_is_honest_and_better_than_the_filter_before(run):
 
 def test_what_is_no_factor():
     with pytest.raises(ValueError, match="sensor must be an InertialSensor, got 'best'"):
-        InertialMotion(np.zeros((1, 2, 6)), 0.1, "best")  # pyright: ignore[reportArgumentType]
+        InertialMotion(np.zeros((1, 2, 6)), 0.1, "best")  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match="steps must be one number, or one for each of 2 samples"):
         InertialMotion(np.zeros((1, 2, 6)), np.zeros((1, 3)), SENSOR)

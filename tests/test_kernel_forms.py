@@ -353,7 +353,7 @@ def test_linear_update_of_trials_with_one_covariance(weights, trials, m, n):
 def test_a_plain_linear_epoch_in_one_call(batch, law, m, n):
     linear = Linear(batch, m, n, "common")
     P = 0.1 * linear.P / np.abs(linear.P).max()
-    told = [np.array(law, dtype=float), linear.anchors, linear.tags, 1 / 3]
+    told: list[Any] = [np.array(law, dtype=float), linear.anchors, linear.tags, 1 / 3]
     found = assert_equal_forms(
         engines.update_plain, linear.mean, P, linear.ranges, *told, atol=1e-8
     )

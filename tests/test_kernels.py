@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import types
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,7 +70,8 @@ def test_the_command_line_says_once_that_kernels_compile(capsys, caplog, monkeyp
         out[0] = 2 * x
 
     for _ in range(2):
-        assert jit.gufunc("()->()")(double).build()(1.0) == 2.0
+        lazy: Any = jit.gufunc("()->()")(double)
+        assert lazy.build()(1.0) == 2.0
     said = capsys.readouterr()
     assert said.out == ""
     (line,) = said.err.splitlines()

@@ -602,7 +602,7 @@ def test_a_building_file_is_a_scene():
 def test_a_filter_is_ours_by_where_its_factory_lives(monkeypatch):
     monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
     assert {leaderboard.source_of(name) for name in belief._FACTORIES} == {"rbl-gym"}
-    belief.register("mine", lambda tags, noise, process: None)  # pyright: ignore[reportArgumentType]
+    belief.register("mine", lambda tags, noise, process: None)  # pyrefly: ignore[bad-argument-type]
     assert leaderboard.source_of("mine") == leaderboard._digest([Path(__file__)])
     with pytest.raises(ValueError, match="filter must be one of"):
         leaderboard.source_of("nobody")

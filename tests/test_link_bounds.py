@@ -1,6 +1,7 @@
 """Bounds of links that are lost or reflected: by integrals and Monte Carlo."""
 
-# pyright: reportCallIssue=false
+# Worlds are unpacked from sequences of no fixed length.
+# pyrefly: ignore-errors[bad-argument-count]
 from __future__ import annotations
 
 import numpy as np

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint
+from typing import Any
 
 import numpy as np
 import pytest
@@ -464,10 +465,10 @@ def test_a_package_adds_its_method_by_an_entry_point(monkeypatch):
 def test_bad_arguments_are_named(changes, message):
     anchors = np.concatenate([5 * bodies.octahedron(2.0)])
     tags = bodies.pyramid()
-    good = {"ranges": ranging.distances(anchors, tags), "anchors": anchors, "tags": tags,
-            "noise": NOISE}  # fmt: skip
+    good = {"anchors": anchors, "tags": tags, "noise": NOISE}
+    told: dict[str, Any] = {"ranges": ranging.distances(anchors, tags), **good, **changes}
     with pytest.raises(ValueError, match=message):
-        estimators.locate(**{**good, **changes})
+        estimators.locate(**told)
 
 
 def test_reference_range_counts_100_db_as_a_millimetre_at_100_m():

@@ -109,7 +109,7 @@ def test_one_tag_tells_a_place_and_leaves_the_rotation_wide():
     filter = iekf_log(np.zeros((1, 3)), NOISE, STILL)
     state = filter.initial(np.eye(3), [4.0, 3, 1], np.diag([9.0] * 3 + [1.0] * 3))
     for _ in range(30):
-        state = filter.predict(state, None, 0.1)  # pyright: ignore[reportArgumentType]
+        state = filter.predict(state, None, 0.1)  # pyrefly: ignore[bad-argument-type]
         ranges = ranging.distances(ANCHORS, np.array([[5.0, 4, 1.5]]))
         ranges = ranges + 0.1 * rng.standard_normal(ranges.shape)
         state = filter.update(state, ranges, ANCHORS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -171,8 +172,8 @@ def test_one_number_of_noise_counts_for_all_axes():
 
 def test_process_noise_from_lists_is_hashable_and_equal_to_that_from_tuples():
     lists: list = [0.1, 0.2, 0.3]
-    assert ProcessNoise(lists, lists) == ProcessNoise((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))  # type: ignore[arg-type]
-    assert hash(ProcessNoise(lists, 1)) == hash(ProcessNoise((0.1, 0.2, 0.3), 1.0))  # type: ignore[arg-type]
+    assert ProcessNoise(lists, lists) == ProcessNoise((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))  # pyrefly: ignore[bad-argument-type]
+    assert hash(ProcessNoise(lists, 1)) == hash(ProcessNoise((0.1, 0.2, 0.3), 1.0))  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize("name", ["rotation_rad", "translation_m"])
@@ -367,7 +368,7 @@ def test_recorded_track_is_driven_through_its_resampled_poses(seed, dt):
 
 I, O, RNG = np.eye(3), np.zeros(3), np.random.default_rng(0)  # noqa: E741
 TIMES = [0.0, 1.0, 2.0]
-BAD_CALLS = {
+BAD_CALLS: dict[str, tuple[Any, tuple[Any, ...], str]] = {
     "steps zero": (motion.constant_twist, (I, O, TWIST, 0), "steps must be an int from 1 to"),
     "steps half": (motion.constant_twist, (I, O, TWIST, 2.5), "steps must be an int from 1 to"),
     "steps nan": (motion.constant_twist, (I, O, TWIST, np.nan), "steps must be an int from 1 to"),
@@ -409,6 +410,6 @@ def test_bad_call_is_refused(case):
 
 
 def test_numbers_of_steps_are_whole():
-    assert motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, np.int64(5)).twists.shape == (5, 6)  # pyright: ignore[reportArgumentType]
+    assert motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, np.int64(5)).twists.shape == (5, 6)  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match=r"steps must be an int from 1 to .*, got 5\.0"):
-        motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, 5.0)  # pyright: ignore[reportArgumentType]
+        motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, 5.0)  # pyrefly: ignore[bad-argument-type]

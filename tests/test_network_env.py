@@ -1,9 +1,8 @@
 """RBL/PlanarNetwork-v0 and EstimateNetwork: the contract, the bound by hand, scalar and vector."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportOptionalMemberAccess=false, reportAttributeAccessIssue=false
-# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
+
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -166,8 +165,9 @@ def test_the_estimates_errors_are_as_large_as_promised(mode, worlds):
         reset = mode == "NextStep" and step == 6
         np.testing.assert_array_equal(reward, 0 if reset else -final["orientation_error_rad"])
         if last:
-            assert set(info["final_obs"][0]) == set(env.single_observation_space.spaces)
-            assert env.single_observation_space.contains(info["final_obs"][0])
+            space: Any = env.single_observation_space
+            assert set(info["final_obs"][0]) == set(space.spaces)
+            assert space.contains(info["final_obs"][0])
     # Of 40 worlds the ratio scatters by 5 % over seeds.
     tolerance = 4 * 0.05 * np.sqrt(40 / worlds)
     assert np.mean(square) == pytest.approx(np.mean(promised), rel=tolerance)
@@ -322,7 +322,7 @@ def test_part_of_the_network_is_estimated_and_the_rest_keeps_what_it_had():
     bearings = np.zeros((4, 4))
     bearings[0, 2], bearings[2, 0] = 0.3, -2.5
     theta, steps, converged = consensus(links, bearings, np.array([0.0, 1.0, 0.0, -1.0]))
-    np.testing.assert_allclose(theta, [0, 1, proj(0.3 + 2.5 + np.pi), -1])
+    np.testing.assert_allclose(theta, [0, 1, float(proj(0.3 + 2.5 + np.pi)), -1])
     assert (steps, converged) == (0, True)
 
 

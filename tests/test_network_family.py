@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
@@ -57,7 +58,7 @@ def test_drawn_networks_by_hand(lengths):
         fields = json.loads(info["scene"])
         plan = NetworkPlan(**fields)
         if lengths == "one":
-            plan = NetworkPlan(**{**fields, "length_std_m": 1e-4 * plan.side_m})
+            plan = dataclasses.replace(plan, length_std_m=1e-4 * plan.side_m)
         n, before = plan.n_nodes, info["positions"]
         counts.add(n)
         stds.add(plan.bearing_std_rad)

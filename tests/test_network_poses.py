@@ -1,8 +1,5 @@
 """Poses of networks in batches: against the sparse estimator, finite differences, the Jacobians."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportOptionalMemberAccess=false, reportAttributeAccessIssue=false
-# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import numpy as np
@@ -150,7 +147,7 @@ def test_variances_grow_with_the_residuals_and_end_at_the_prior():
     ratio = np.trace(wide.covariance[1:], axis1=1, axis2=2).sum()
     ratio /= np.trace(sharp.covariance[1:], axis1=1, axis2=2).sum()
     assert ratio == pytest.approx(sharp.chi_square / max(float(sharp.chi_square), 1), rel=0.05)
-    wild = network_belief(links, bearings + np.arange(N), lengths, theta, start, proud)
+    wild = network_belief(links, bearings + np.arange(float(N)), lengths, theta, start, proud)
     variance = np.diagonal(wild.covariance, axis1=-2, axis2=-1)
     assert (variance <= np.array([1.8, 5, 5]) ** 2 * (1 + 1e-12)).all()
     assert (variance[1:] > 0).all()

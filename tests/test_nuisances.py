@@ -1,6 +1,7 @@
 """Bounds with nuisances: brute force over all parameters, finite differences, Monte Carlo."""
 
-# pyright: reportCallIssue=false, reportOperatorIssue=false
+# Worlds are unpacked from sequences of no fixed length.
+# pyrefly: ignore-errors[bad-argument-count]
 from __future__ import annotations
 
 import numpy as np
@@ -327,7 +328,7 @@ def test_everything_broadcasts():
     [
         (lambda w: bounds.Nuisances("tags"), "offset must be one of"),
         (lambda w: bounds.Nuisances(groups="wall"), "groups must be one of"),
-        (lambda w: bounds.Nuisances(bias=0.1), "bias must be a LinkBias or None, got 0.1"),  # pyright: ignore[reportArgumentType]
+        (lambda w: bounds.Nuisances(bias=0.1), "bias must be a LinkBias or None, got 0.1"),  # pyrefly: ignore[bad-argument-type]
         (lambda w: bounds.Nuisances(anchor_std_m=-0.1), "anchor_std_m must not be negative"),
         (lambda w: bounds.pose_crb(*w, NOISE, anchor_std_m=[0.1, 0.2]),
          r"anchor_std_m must be one number, or have shape \(5,\) or \(5, 3\), got \(2,\)"),
@@ -337,7 +338,7 @@ def test_everything_broadcasts():
         (lambda w: bounds.marginal_information(np.diag([1.0] * 7 + [0])), "joint must be"),
         (lambda w: bounds.epoch_information(bounds.RangeEpoch(*w[:3], w[3] * np.nan, NOISE)),
          "translation must be finite"),
-        (lambda w: bounds.epoch_information(bounds.RangeEpoch(*w, 0.1)),  # pyright: ignore[reportArgumentType]
+        (lambda w: bounds.epoch_information(bounds.RangeEpoch(*w, 0.1)),  # pyrefly: ignore[bad-argument-count]
          "noise must be a noise law such as"),
         (lambda w: bounds.posterior_step(
             np.eye(8), bounds.RangeEpoch(*w, NOISE), None, bounds.Nuisances(bias=LinkBias(0.1))),

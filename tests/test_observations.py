@@ -190,9 +190,9 @@ def test_spaces_are_declared_or_found():
     def declared(seen: Seen) -> np.ndarray:
         return seen.belief.translation / 100
 
-    declared.space = spaces.Box(-1.0, 1.0, (3,), np.float64)  # pyright: ignore[reportFunctionMemberAccess]
+    declared.space = spaces.Box(-1.0, 1.0, (3,), np.float64)  # pyrefly: ignore[missing-attribute]
     env = EstimatePose(TrackingEnv("hall"), observation=declared)
-    assert env.observation_space is declared.space  # pyright: ignore[reportFunctionMemberAccess]
+    assert env.observation_space is declared.space  # pyrefly: ignore[missing-attribute]
     assert env.reset(seed=1)[0].dtype == np.float64
 
 
@@ -226,7 +226,7 @@ def test_wrong_views_are_named(observation, named):
         (TrackingVectorEnv(2, "hall"), VectorEstimatePose),
     ):
         with pytest.raises(ValueError, match=named):
-            wrapper(env, observation=observation)  # pyright: ignore[reportArgumentType]
+            wrapper(env, observation=observation)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_views_that_change_their_shape_or_are_not_finite_are_named():

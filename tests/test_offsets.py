@@ -378,7 +378,7 @@ def test_a_filter_refuses_what_is_no_offset():
 @pytest.mark.parametrize("robust", [False, True])
 def test_a_filter_with_biases_that_are_nothing_is_the_plain_one(robust):
     (plain, P, _), (biased, R, _) = (
-        track("tag", 5, name=name, robust=robust, **law)  # pyright: ignore[reportArgumentType]
+        track("tag", 5, name=name, robust=robust, **law)
         for name, law in (("iekf", {}), ("iekf-bias", {"bias_std_m": 1e-6, "common_std_m": 0.0}))
     )
     # Of squares the same; the losses differ.

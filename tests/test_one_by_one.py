@@ -58,7 +58,7 @@ Batched = one_by_one(OneBody)
 
 
 class NoNoise(OneBody):
-    def update(self, state, ranges, anchors, links=None):
+    def update(self, state, ranges, anchors, links=None):  # pyrefly: ignore[bad-override]
         super().update(state, ranges, anchors, links)
 
 

@@ -1,7 +1,5 @@
 """Orientations of planar networks: the references, the bound, the proof, the size."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import itertools
@@ -275,7 +273,9 @@ def test_trivial_networks(method):
     np.testing.assert_allclose(orientations([[1, 0]], [0.5], 2, method=method), [0, -0.5])
     tree = [[0, 1], [2, 0], [2, 3]]
     np.testing.assert_allclose(
-        orientations(tree, [3.0, 1.0, -2.5], 4, method=method), [0, 3, -1, proj(-3.5)], atol=1e-12
+        orientations(tree, [3.0, 1.0, -2.5], 4, method=method),
+        [0, 3, -1, float(proj(-3.5))],
+        atol=1e-12,
     )
     twice = orientations([[0, 1], [1, 0], [0, 1]], [0.5, -0.7, 0.6], 2, method=method)
     np.testing.assert_allclose(twice, [0, 0.6], atol=1e-3 if method != "tree" else 0.2)

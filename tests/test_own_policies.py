@@ -69,7 +69,7 @@ def test_a_model_with_predict_keeps_its_memory_within_an_episode():
 
 def test_a_model_with_masks_gets_them():
     class Masked(Model):
-        def predict(self, observation, action_masks, **told):
+        def predict(self, observation, action_masks, **told):  # pyrefly: ignore[bad-override]
             assert action_masks.shape == (2, 24)
             return np.zeros((2, 12)), None
 
@@ -165,7 +165,7 @@ def test_a_missing_library_is_named_before_a_training_begins(monkeypatch, capsys
 
 @needs("torch", "stable_baselines3")
 def test_a_model_of_stable_baselines3():
-    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO
 
     from rbl_gym.studies.learning.sb3_models import policy_of
     from rbl_gym.wrappers.sb3 import Sb3VecEnv

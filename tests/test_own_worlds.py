@@ -16,7 +16,7 @@ from tests.helpers import random_world, twist_filters
 B, M, N = 5, 4, 5
 
 
-def worlds():
+def worlds() -> dict[str, Any]:
     """Everything that each of five trials has of its own."""
     rng = np.random.default_rng(3)
     anchors, _, rotation, translation = random_world(rng, M, N, (B,))
@@ -81,7 +81,7 @@ def test_one_state_goes_on_by_many_steps():
 
 
 def test_the_noise_of_many_motions():
-    process = motion.ProcessNoise(np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), 0.7)  # pyright: ignore[reportArgumentType]
+    process = motion.ProcessNoise(np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), 0.7)  # pyrefly: ignore[bad-argument-type]
     np.testing.assert_array_equal(
         process.std(), [[0.1, 0.2, 0.3, 0.7, 0.7, 0.7], [0.4, 0.5, 0.6, 0.7, 0.7, 0.7]]
     )
@@ -90,7 +90,7 @@ def test_the_noise_of_many_motions():
     twist = np.array([0.1, -0.4, 0.2, 1, 2, 3])
     together = process.covariance(twist, np.array([0.5, 2.0]))
     for i, dt in enumerate((0.5, 2.0)):
-        one = motion.ProcessNoise(process.rotation_rad[i], 0.7)  # pyright: ignore
+        one = motion.ProcessNoise(process.rotation_rad[i], 0.7)  # pyrefly: ignore[bad-index]
         np.testing.assert_allclose(together[i], one.covariance(twist, dt), rtol=1e-12)
 
 

@@ -1,5 +1,7 @@
 """Notes of a placement: the requirement that decides, better usual layouts, a high NEES."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -84,7 +86,7 @@ def test_a_position_that_decides_with_one_anchor_less():
         "name": "a", "verdict": "fail", "required": {"share": 0.95},
         "decides": {"requirement": "position_m", "value": None, "limit": 0.3},
     }  # fmt: skip
-    result = {"zones": [zone | {"verdict": "pass"}], "tags_m": [[0, 0, 0]]}
+    result: dict[str, Any] = {"zones": [zone | {"verdict": "pass"}], "tags_m": [[0, 0, 0]]}
     assert deciding_notes(result) == []
     result["fewest"] = {"one_less": {"n_anchors": 5, "zones": [zone]}}
     assert deciding_notes(result) == [

@@ -105,7 +105,7 @@ def turned(env, info, mirror):
     scene = batch_of(env).task.scene
     low, high = scene.volume.bounds()
     # Legal places that do not lie evenly about the volume are no mirror's.
-    mirror &= np.array_equal(sum(scene.anchor_region.bounds())[:2], (low + high)[:2])  # pyright: ignore[reportIndexIssue]
+    mirror &= np.array_equal(sum(scene.anchor_region.bounds())[:2], (low + high)[:2])  # pyrefly: ignore[unsupported-operation]
     sign = np.where(info["region"][:3] < 0.5 * (low + high), -1, 1) if mirror else np.ones(3)
     return sign * [1, 1, 0] + [0, 0, 1]
 
@@ -307,7 +307,7 @@ def test_action_masks_are_the_mounts_that_are_free():
     envs = gym.make_vec(ID, num_envs=2, **arguments)
     envs.reset(seed=3)
     envs.step(np.array([4, 9]))
-    both = envs.unwrapped.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
+    both = envs.unwrapped.action_masks()  # pyrefly: ignore[missing-attribute]
     assert [list(np.flatnonzero(~row)) for row in both] == [[4], [9]]
     with pytest.raises(ValueError, match="mode must be 'mounts' for action masks"):
         gym.make(ID).get_wrapper_attr("action_masks")()

@@ -89,7 +89,7 @@ def test_an_episode_equals_that_of_its_scene_alone(mode, mirror):
         got, info = env.reset(seed=seed)
         one = task_told(info)
         alone = AnchorPlacementEnv(
-            one.scene,  # pyright: ignore[reportArgumentType]
+            one.scene,  # pyrefly: ignore[bad-argument-type]
             racks=one.racks,
             n_anchors=one.n_anchors,
             sight=one.racks > 0,

@@ -153,9 +153,9 @@ def test_views_by_path_and_with_a_space_of_their_own():
     def first(placing):
         return placing.flat[:, :3]
 
-    first.space = gym.spaces.Box(-2, 2, (3,), np.float32)  # pyright: ignore[reportFunctionMemberAccess]
+    first.space = gym.spaces.Box(-2, 2, (3,), np.float32)  # pyrefly: ignore[missing-attribute]
     envs = gym.make_vec(ID, num_envs=2, observation=first)
-    assert envs.single_observation_space == first.space  # pyright: ignore[reportFunctionMemberAccess]
+    assert envs.single_observation_space == first.space  # pyrefly: ignore[missing-attribute]
     assert envs.reset(seed=1)[0].shape == (2, 3)
 
 

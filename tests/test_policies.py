@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import zipfile
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -102,7 +103,7 @@ def test_a_wrong_observation_is_named():
         random_policy()(np.zeros((2, 6)))
 
 
-def arrays(**changes):
+def arrays(**changes) -> dict[str, Any]:
     policy = random_policy()
     good = {
         "weight_0": policy.weights[0],

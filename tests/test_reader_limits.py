@@ -70,20 +70,20 @@ def test_a_policy_whose_archive_points_before_its_begin(tmp_path):
     [
         (lambda: PlanarNetworkEnv(n_nodes=10**9), "n_nodes must be an int from 2 to 10000, got 10"),
         (lambda: PlanarNetworkEnv(n_nodes=1), "n_nodes must be an int from 2 to 10000, got 1"),
-        (lambda: PlanarNetworkEnv(render_mode=np.ones(2)), "render_mode must be None or"),  # pyright: ignore
-        (lambda: AnchorPlacementEnv(mirror=np.ones(2)), "mirror must be True or False, got"),  # pyright: ignore
+        (lambda: PlanarNetworkEnv(render_mode=np.ones(2)), "render_mode must be None or"),  # pyrefly: ignore[bad-argument-type]
+        (lambda: AnchorPlacementEnv(mirror=np.ones(2)), "mirror must be True or False, got"),  # pyrefly: ignore[bad-argument-type]
         (
             lambda: checks.check_count("num_envs", 10**9, most=9),
             "num_envs must be an int from 1 to 9",
         ),
-        (lambda: batch.reset_mask("x", 2), "options must be a dict or None, got 'x'"),  # pyright: ignore
+        (lambda: batch.reset_mask("x", 2), "options must be a dict or None, got 'x'"),  # pyrefly: ignore[bad-argument-type]
         (lambda: batch.reset_mask({"reset_mask": [[1], [1, 2]]}, 2), "reset_mask must be an array"),
-        (lambda: batch.seeds_of("ab", 2), "seed must be an int, a list of ints or None, got 'ab'"),  # pyright: ignore
+        (lambda: batch.seeds_of("ab", 2), "seed must be an int, a list of ints or None, got 'ab'"),  # pyrefly: ignore[bad-argument-type]
         (lambda: batch.seeds_of([1], 2), r"seed must have 2 seeds, .* got \[1\]"),
-        (lambda: batch.seeds_of([1, 1.5], 2), "seed must be a non-negative int or None"),  # pyright: ignore
+        (lambda: batch.seeds_of([1, 1.5], 2), "seed must be a non-negative int or None"),  # pyrefly: ignore[bad-argument-type]
         (lambda: batch.seeds_of(-1, 2), "seed must be a non-negative int .* got -1"),
         (
-            lambda: wrappers.EstimatePose(TrackingEnv(), options={1: 2}),  # pyright: ignore
+            lambda: wrappers.EstimatePose(TrackingEnv(), options={1: 2}),  # pyrefly: ignore[bad-assignment]
             "options must be a dict of names and values, or None, got {1: 2}",
         ),
     ],

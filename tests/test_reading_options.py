@@ -47,8 +47,9 @@ def points(column: str, names, places) -> str:
 
 def truth(path, columns: str = "t,x,y,z,yaw_deg") -> str:
     yaw = np.rad2deg(np.arctan2(path.rotation[:, 1, 0], path.rotation[:, 0, 0]))
-    values = dict(zip("xyz", path.translation.T, strict=True)) | {
+    values: dict[str, Any] = {
         "t": 0.1 * np.arange(len(yaw)), "yaw_deg": yaw,
+        **dict(zip("xyz", path.translation.T, strict=True)),
     }  # fmt: skip
     names = columns.split(",")
     return table(columns, np.stack([values[name] for name in names], axis=-1).tolist())

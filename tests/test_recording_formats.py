@@ -554,7 +554,7 @@ def test_formats_that_do_not_fit(tmp_path, options, message):
 
 def test_a_recording_made_of_arrays_has_an_empty_report(tmp_path):
     log = read(tmp_path)
-    bare = Recording(*log[: Recording._fields.index("report")])  # pyright: ignore[reportArgumentType]
+    bare = Recording(*log[: Recording._fields.index("report")])  # pyrefly: ignore[bad-argument-type]
     assert bare.report == Report() == Report(0, {}, 0, ())
     assert bare.anchors_by_epoch.shape == (2, 3, 3)
     np.testing.assert_array_equal(bare.anchors_by_epoch[1], bare.anchors)

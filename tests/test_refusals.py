@@ -1,6 +1,7 @@
 """Errors of functions that no other test covers, each by its message."""
 
-# pyright: reportArgumentType=false
+# Most arguments here are wrong on purpose.
+# pyrefly: ignore-errors[bad-argument-type]
 from __future__ import annotations
 
 import dataclasses

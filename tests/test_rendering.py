@@ -168,7 +168,7 @@ def test_human_rendering_shows_the_frames(monkeypatch):
     env: Any = HumanRendering(EstimatePose(make("Tracking"), "iekf"))
     env.reset(seed=0)
     env.step(0)
-    import pygame  # pyright: ignore[reportMissingImports]
+    import pygame
 
     shown = pygame.surfarray.array3d(env.window)
     np.testing.assert_array_equal(shown.transpose(1, 0, 2), env.env.render())

@@ -97,7 +97,7 @@ def test_a_named_reward_survives_the_spec_as_json():
     env = EstimatePose(env, reward=reward)
     assert env.spec is not None
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert json.loads(env.spec.to_json()) == json.loads(again.spec.to_json())  # pyright: ignore[reportOptionalMemberAccess]
+    assert json.loads(env.spec.to_json()) == json.loads(again.spec.to_json())  # pyrefly: ignore[missing-attribute]
     _ = env.reset(seed=1), again.reset(seed=1)
     assert env.step(0)[1] == again.step(0)[1]
 

@@ -1,7 +1,5 @@
 """The adapter to stable-baselines3, and the training that uses it."""
 
-# The package may be absent.
-# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import json
@@ -163,7 +161,7 @@ def test_trainings_of_different_seeds_see_different_worlds(monkeypatch):
     seen = []
 
     def make(task, num_envs, autoreset_mode="SameStep"):
-        envs = gym.make_vec(
+        envs: Any = gym.make_vec(
             f"rbl_gym:{task.env_id}", num_envs=num_envs, autoreset_mode=autoreset_mode
         )
         reset = envs.reset

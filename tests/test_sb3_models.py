@@ -1,7 +1,5 @@
 """Models of stable-baselines3 as policy files: the same actions, and unsupported models."""
 
-# The packages may be absent.
-# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import json
@@ -94,9 +92,10 @@ def test_masks_are_kept(kind, tmp_path):
     policies.save(policy_of(model), tmp_path / "p.npz")
     play = policies.load(tmp_path / "p.npz").player()
     observations, _ = envs.reset(seed=1)
+    worlds: Any = envs.unwrapped
     told = 0
     for _ in range(5):
-        masks = envs.unwrapped.action_masks()
+        masks = worlds.action_masks()
         free, _ = model.predict(observations, deterministic=True)
         wanted, _ = model.predict(observations, deterministic=True, action_masks=masks)
         np.testing.assert_array_equal(play(envs, observations), wanted)

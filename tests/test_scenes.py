@@ -142,7 +142,7 @@ def test_scenes_are_hashable_immutable_and_pickle(name):
     assert hash(scene) == hash(scenes.get({"name": name}))
     assert pickle.loads(pickle.dumps(scene)) == scene
     with pytest.raises(dataclasses.FrozenInstanceError):
-        scene.dt = 1.0  # type: ignore[misc]
+        scene.dt = 1.0  # pyrefly: ignore[read-only]
 
 
 # --- overrides --------------------------------------------------------------------------------

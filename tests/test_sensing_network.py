@@ -1,7 +1,5 @@
 """Sensing networks: bearings, edge angles, graphs, cycle bases, what is localizable."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
-# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import itertools

@@ -170,7 +170,7 @@ def test_files_of_other_networks_are_refused(tmp_path, change, message):
 # --- craft ------------------------------------------------------------------------------------
 
 
-def situation(rng, batch=3, m=4):
+def situation(rng, batch=3, m=4) -> dict[str, Any]:
     low = rng.standard_normal((batch, 6, 6))
     return {
         "rotation": rotations.random(rng, (batch,)),
@@ -203,7 +203,7 @@ def test_a_scene_that_is_turned_turns_the_velocities():
     told = situation(rng)
     turn = rotations.exp(np.array([0.0, 0.0, 1.1]))
     both = np.kron(np.eye(2), turn)
-    turned = {
+    turned: dict[str, Any] = {
         **told,
         "rotation": turn @ told["rotation"],
         "translation": told["translation"] @ turn.T,

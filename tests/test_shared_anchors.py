@@ -23,7 +23,7 @@ TWO: dict[str, Any] = {
 
 @needs("stable_baselines3")
 def test_sb3_checker():
-    from stable_baselines3.common.env_checker import (  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.env_checker import (
         check_env as check_sb3,
     )
 

@@ -360,7 +360,7 @@ def test_measure_of_a_batch_equals_its_episodes_one_by_one(name):
     batch = draw(scene, 10, (3,))
     together = simulation.measure_epoch(scene, simulation.epoch_of(batch, 2), batch.anchors)
     for b in range(3):
-        single = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
+        single = Episode(*(None if array is None else array[b] for array in batch))  # pyrefly: ignore[bad-argument-type]
         alone = simulation.measure_epoch(scene, simulation.epoch_of(single, 2), single.anchors)
         for got, want in zip(together, alone, strict=True):
             np.testing.assert_allclose(got[b], want, rtol=1e-13)

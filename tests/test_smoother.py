@@ -387,7 +387,7 @@ def test_laws_are_factors_and_motions():
 def test_bad_models_are_named():
     _, tags, _, _ = world(12)
     with pytest.raises(ValueError, match="biases"):
-        LogModel(tags, NOISE, UnknownTwist(WANDER, PROCESS), (0.1,))  # pyright: ignore[reportArgumentType]
+        LogModel(tags, NOISE, UnknownTwist(WANDER, PROCESS), (0.1,))  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match="height"):
         Level(1.0)
     with pytest.raises(ValueError, match="tilt_std_rad"):

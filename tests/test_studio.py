@@ -495,7 +495,7 @@ def opened(tmp_path, monkeypatch):
 
     monkeypatch.setattr(place, "Display", NoDisplay)
     monkeypatch.setattr(place.design, "design_layout", search)
-    opening.searched = searched
+    opening.searched = searched  # pyrefly: ignore[missing-attribute]
     yield opening
     for page in pages:
         page.stop()

@@ -171,8 +171,8 @@ def test_the_server_is_on_loopback_and_speaks_to_its_own_pages_alone(served):
     assert served.url.startswith("http://127.0.0.1:")
     address = served.url.replace("http", "ws")
     with pytest.raises(InvalidStatus, match="403"):
-        connect(address, origin="http://example.org:8080")  # type: ignore[arg-type]
-    with connect(address, origin=served.url):  # type: ignore[arg-type]
+        connect(address, origin="http://example.org:8080")  # pyrefly: ignore[bad-argument-type]
+    with connect(address, origin=served.url):
         pass
     assert served.server.request_share_url() is None
     for host in ("192.0.2.1", "no such host"):

@@ -270,7 +270,7 @@ def test_other_environments_are_shown_as_they_are_rendered():
     frame = next(env_frames(env))
     np.testing.assert_array_equal(frame.picture, env.render())
     with pytest.raises(ValueError, match="env must be"):
-        env_frames("RBL/Tracking-v0")  # pyright: ignore[reportArgumentType]
+        env_frames("RBL/Tracking-v0")  # pyrefly: ignore[bad-argument-type]
 
 
 def random_policy(task: str, folder) -> str:

@@ -1,4 +1,3 @@
-# pyright: reportCallIssue=false, reportAttributeAccessIssue=false
 """Anchors off by their survey: scenes of them, and the filter whose states their places are."""
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def test_an_update_is_the_maximum_a_posteriori_of_pose_and_places():
     # The derivative by the places is taken twice; what is left is of third order.
     np.testing.assert_allclose(found, want, atol=1e-3)
     # Its covariance is the inverse of prior and ranges together, all 21 states.
-    epoch = bounds.RangeEpoch(told + state.extra.reshape(5, 3), tags, *state[:2], NOISE)
+    epoch = bounds.RangeEpoch(told + state.extra.reshape(5, 3), tags, state[0], state[1], NOISE)
     J = bounds.with_nuisances(np.linalg.inv(prior), 15)
     J = bounds.posterior_step(J, epoch, None, bounds.Nuisances(anchor_std_m=std))
     scale = np.r_[np.ones(6), std.ravel()]
@@ -81,7 +80,7 @@ def test_the_filter_that_knows_the_survey_is_at_its_bound(offset):
 
 
 def test_environments_tell_surveyed_places_that_stay_off():
-    env = gym.make("rbl_gym:RBL/Tracking-v0", scene={"name": "auv_buoys", "survey_std_m": 2.0})
+    env: Any = gym.make("rbl_gym:RBL/Tracking-v0", scene={"name": "auv_buoys", "survey_std_m": 2.0})
     seen, info = env.reset(seed=3)
     assert env.observation_space.contains(seen)
     off = seen["anchors"] - info["anchors"]

@@ -34,7 +34,7 @@ WORLDS: dict[str, tuple[str, dict[str, Any]]] = {
 every_world = pytest.mark.parametrize("kind", WORLDS)
 # What a filter leaves of rounding.
 TOLERANCE = {"rtol": 2e-5, "atol": 2e-6}
-CLASSES = {
+CLASSES: dict[str, tuple[type, type]] = {
     MOBILE: (MobileAnchorsEnv, MobileAnchorsVectorEnv),
     SELECTION: (AnchorSelectionEnv, AnchorSelectionVectorEnv),
 }
@@ -362,7 +362,7 @@ def test_nees_is_six(kind, worlds):
     """Means over worlds of a chi-square of 6 degrees; at epochs far apart about independent."""
     if kind == "selection":
         env: Any = AnchorSelectionVectorEnv(worlds, autoreset_mode="Disabled")
-        policy = controllers.greedy_blind
+        policy: Any = controllers.greedy_blind
     else:
         env = MobileAnchorsVectorEnv(worlds, kind, autoreset_mode="Disabled")
         policy = controllers.orbit

@@ -162,7 +162,7 @@ class ForgetsWhereNothingIs(Wrapped):
 
 
 class OfTheOldInterface(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
+    def update(self, state, ranges, anchors, links=None):  # pyrefly: ignore[bad-override]
         return super().update(state, ranges, anchors, links)
 
 
@@ -342,7 +342,9 @@ def test_a_locator_is_as_deterministic_as_it_should_be():
 
 
 def test_states_that_commands_cannot_take_apart_are_named():
-    class Wrapped(estimators.IteratedEkf):
+    plain: Any = estimators.IteratedEkf
+
+    class Wrapped(plain):
         """Its state is a dict."""
 
         def initial(self, *prior):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -59,8 +61,9 @@ def test_disabled_refuses_to_step_past_the_end():
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
+    told: dict[str, Any] = {"num_envs": 2, **arguments}
     with pytest.raises(ValueError, match=message):
-        TrackingVectorEnv(**{"num_envs": 2, **arguments})
+        TrackingVectorEnv(**told)
 
 
 def test_bad_calls_are_named():

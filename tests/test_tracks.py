@@ -24,7 +24,7 @@ KNOWN = np.diag([0.01] * 3 + [0.04] * 3)
 EPOCHS = 30
 
 
-def a_log(seed: int = 0, noise: Any = None, lost: float = 0.2) -> tuple[Any, Any, Reading]:
+def a_log(seed: int = 0, noise: Any = None, lost: float = 0.2) -> tuple[Any, Any, Any]:
     """Tags, prior and log of a body at rest: lost links, an epoch without any, gaps, outliers."""
     rng = np.random.default_rng(seed)
     anchors, tags, rotation, translation = random_world(rng, 5, 4)
@@ -35,10 +35,10 @@ def a_log(seed: int = 0, noise: Any = None, lost: float = 0.2) -> tuple[Any, Any
     links = rng.random(shape) >= lost
     links[7], links[8:12] = False, True
     ranges[~links] = 0.0
-    dt = np.full(EPOCHS, 0.1)
+    dt: Any = np.full(EPOCHS, 0.1)
     dt[0], dt[15], dt[25] = 0.0, 1.0, 10.0
     twist = np.zeros((EPOCHS, 6))
-    log = Reading(ranges, np.tile(anchors, (EPOCHS, 1, 1)), links, noise, twist, dt)  # pyright: ignore[reportArgumentType]
+    log = Reading(ranges, np.tile(anchors, (EPOCHS, 1, 1)), links, noise, twist, dt)
     return tags, (rotation, translation, KNOWN), log
 
 

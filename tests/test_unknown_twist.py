@@ -179,7 +179,7 @@ def test_drawn_trajectories_have_the_laws_moments():
     [
         (lambda: ut.WanderingTwist(turn_rate_rad_s=-1), "turn_rate_rad_s must not be negative"),
         (
-            lambda: ut.WanderingTwist(speed_m_s=(1, 2)),  # pyright: ignore[reportArgumentType]
+            lambda: ut.WanderingTwist(speed_m_s=(1, 2)),  # pyrefly: ignore[bad-argument-type]
             "speed_m_s must be one number or three",
         ),
         (lambda: ut.WanderingTwist(acceleration=np.nan), "acceleration must be finite"),
@@ -193,17 +193,17 @@ def test_drawn_trajectories_have_the_laws_moments():
         ),
         (
             lambda: ut.simulate_wandering(
-                np.eye(3), np.zeros(3), PROCESS, PROCESS, 0.1, 1, np.random.default_rng(0)  # pyright: ignore[reportArgumentType]
+                np.eye(3), np.zeros(3), PROCESS, PROCESS, 0.1, 1, np.random.default_rng(0)  # pyrefly: ignore[bad-argument-type]
             ),
             "law must be a WanderingTwist, got ProcessNoise",
         ),
         (
-            lambda: ut.simulate_wandering(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 1, 0),  # pyright: ignore[reportArgumentType]
+            lambda: ut.simulate_wandering(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 1, 0),  # pyrefly: ignore[bad-argument-type]
             "rng must be a numpy.random.Generator, .* got 0",
         ),
         (
             lambda: bounds.posterior_step(
-                np.eye(12), EPOCH, bounds.UnknownTwist(np.zeros(6), 0.1, LAW, LAW)  # pyright: ignore[reportArgumentType]
+                np.eye(12), EPOCH, bounds.UnknownTwist(np.zeros(6), 0.1, LAW, LAW)  # pyrefly: ignore[bad-argument-type]
             ),
             "process must be a motion.ProcessNoise, got WanderingTwist",
         ),

@@ -185,7 +185,7 @@ def test_single_ranges_are_never_searched_and_a_third_tag_that_speaks_again_is(s
     assert searches == []
     after = filter.update(state, ranges, ANCHORS)
     assert searches == [1]
-    assert metrics.nees(metrics.pose_error(*after[:2], *pose), after.covariance) < 22
+    assert metrics.nees(metrics.pose_error(after[0], after[1], *pose), after.covariance) < 22
 
 
 def test_a_lost_track_is_searched_once(searches):

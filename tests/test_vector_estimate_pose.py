@@ -77,6 +77,6 @@ def test_wrong_environments_and_names_are_named():
     mistaken: Any = TrackingVectorEnv(2)
     with pytest.raises(ValueError, match=r"got the vector environment .*: use VectorEstimatePose"):
         EstimatePose(mistaken)
-    mistaken = gym.make(ID)
+    single: Any = gym.make(ID)
     with pytest.raises(ValueError, match=r"got the single environment .*: use EstimatePose"):
-        VectorEstimatePose(mistaken)
+        VectorEstimatePose(single)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def test_the_command_prints_the_same(found, capsys, tmp_path):
 
 
 def test_a_scene_keeps_what_is_its_own():
-    own = {**SCENE, "steps": 2, "links": {"offset": "tag"}, "survey_std_m": 0.05}
+    own: dict[str, Any] = {**SCENE, "steps": 2, "links": {"offset": "tag"}, "survey_std_m": 0.05}
     own["inertial"] = {"kind": "consumer", "gyro_noise": 1e-3}
     found = what_if.what_if(own, 2, 0)
     unknowns = {r["unknown"] for r in found["rows"]}

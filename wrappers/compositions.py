@@ -162,7 +162,7 @@ def _belief_of(told: dict[str, np.ndarray]) -> PoseBelief:
     return PoseBelief(rotation, told["belief_translation"], told["belief_covariance"], rotation)
 
 
-class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class TaskEnv(Task, gym.Env[Any, Any]):
     """One world of a task."""
 
     metadata: dict[str, Any] = TrackingEnv.metadata
@@ -202,7 +202,7 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
         self.inner.close()
 
 
-class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):
     """`num_envs` worlds of a task; seeding and autoreset as `BatchEnv`."""
 
     def _compose(

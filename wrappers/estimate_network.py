@@ -115,7 +115,7 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._sensing = env.unwrapped.sensing
         self._rng = seeding.np_random()[0]
         self._theta: FloatArray | None = None
-        self._places = np.zeros((env.unwrapped.n_nodes, 2))
+        self._places: FloatArray = np.zeros((env.unwrapped.n_nodes, 2))
         self.observation_space = _space(env.observation_space, self._sensing)
 
     def reset(
@@ -181,7 +181,8 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
         self._sensing = env.unwrapped.sensing
         self._rngs = [seeding.np_random()[0] for _ in range(env.num_envs)]
         shape = (env.num_envs, env.unwrapped.n_nodes)
-        self._theta, self._places = np.zeros(shape), np.zeros((*shape, 2))
+        self._theta: FloatArray = np.zeros(shape)
+        self._places: FloatArray = np.zeros((*shape, 2))
         self._over = np.zeros(env.num_envs, dtype=np.bool_)
         self.single_observation_space = _space(env.single_observation_space, self._sensing)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
@@ -328,7 +329,7 @@ def _farthest(sensing: Sensing) -> float:
 
 def _space(inner: spaces.Space[Any], sensing: Sensing) -> spaces.Dict:
     assert isinstance(inner, spaces.Dict)
-    size = inner["bearings"].shape[:1]  # pyright: ignore[reportOptionalSubscript]
+    size = inner["bearings"].shape[:1]  # pyrefly: ignore[unsupported-operation]
     added: dict[str, spaces.Space[Any]] = {
         "orientations": spaces.Box(-np.pi, np.pi, size, np.float64),
         "orientation_std": spaces.Box(0.0, 2 * sensing.prior_std_rad, size, np.float64),

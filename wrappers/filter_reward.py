@@ -273,4 +273,4 @@ def _is_filtered(reward: str, filter: Any, options: Any) -> bool:
 
 
 # Gymnasium reads the render modes here.
-anchor_placement.metadata = AnchorPlacementEnv.metadata  # pyright: ignore[reportFunctionMemberAccess]
+anchor_placement.metadata = AnchorPlacementEnv.metadata  # pyrefly: ignore[missing-attribute]

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from rbl_gym.extras import require
 
 require("stable_baselines3", "rl", "Sb3VecEnv")
-from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.vec_env.base_vec_env import (  # noqa: E402
     VecEnv,
     VecEnvIndices,
 )
@@ -129,7 +129,7 @@ class Sb3VecEnv(VecEnv):
     ) -> list[Any]:
         """Return ``action_masks`` of each world; other names raise an error."""
         if method_name == "action_masks":
-            masks = self.envs.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
+            masks = self.envs.action_masks()  # pyrefly: ignore[missing-attribute]
             return [masks[i] for i in self._get_indices(indices)]
         raise NotImplementedError(
             f"{method_name!r} cannot be called: the worlds of a native vector environment have no "

@@ -61,7 +61,7 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         check_single(env, "VectorSelectAnchors")
         gym.Wrapper.__init__(self, env)
         scene_of(env)
-        self._n_anchors = env.observation_space["links"].shape[0]  # pyright: ignore[reportIndexIssue]
+        self._n_anchors = env.observation_space["links"].shape[0]  # pyrefly: ignore[bad-index]
         self._rendered = getattr(env.unwrapped, "film", None) is not None
         self.action_space = spaces.MultiBinary(self._n_anchors)
         self._still = _zeros(env.action_space)
@@ -101,7 +101,7 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
         check_vector(env, "SelectAnchors")
         VectorWrapper.__init__(self, env)
         scene_of(env)
-        self._shape = env.num_envs, env.single_observation_space["links"].shape[0]  # pyright: ignore[reportIndexIssue]
+        self._shape = env.num_envs, env.single_observation_space["links"].shape[0]  # pyrefly: ignore[bad-index]
         self.single_action_space = spaces.MultiBinary(self._shape[1])
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._still = _zeros(env.action_space)

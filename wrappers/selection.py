@@ -90,6 +90,7 @@ class _AnchorSelection(Task):
 
     def subset_of(self, chosen: BoolArray) -> np.ndarray:
         """Return the action (...) of ``mode="subset"`` that chooses these k anchors (..., M)."""
+        assert self._subsets is not None
         alike = self._subsets == np.asarray(chosen, dtype=np.bool_)[..., None, :]
         return alike.all(axis=-1).argmax(axis=-1)
 

@@ -53,7 +53,7 @@ class _Bodies(TrackingVectorEnv):
         return start
 
 
-class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):
     """`num_envs` independent `SharedAnchorsEnv`; seeding and autoreset as `BatchEnv`."""
 
     inner: Any = None
@@ -143,7 +143,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         observation, reward, terminated, truncated, info = self.inner.step(each)
         together = self._combine(reward.reshape(-1, self.n_bodies), axis=-1)
         ended = (flag[:: self.n_bodies] for flag in (terminated, truncated))
-        return self._grouped(observation), together, *ended, self._informed(info)  # pyright: ignore[reportReturnType]
+        return self._grouped(observation), together, *ended, self._informed(info)
 
     def _grouped(self, observation: Any) -> Any:
         """Return observations (B K, ...) as those of B worlds."""
@@ -203,7 +203,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
             self.inner.close(**kwargs)
 
 
-class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):
     """Move the anchors, which several bodies share, so that the poses of all bodies are known well.
 
     ## Description

@@ -68,7 +68,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._named = named_filter(filter, options)
         self._varied = family_of(env) is not None
         if self._varied:
-            self._scene = env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
+            self._scene = env.unwrapped.world  # pyrefly: ignore[missing-attribute]
         self._reward = reward_of(reward)
         self._viewer = viewer_of(observation)
         ranged = "ranges" in getattr(env.single_observation_space, "spaces", {})
@@ -129,7 +129,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     ) -> None:
         """Return states of new episodes: priors of `info`, updated with the first ranges."""
         if self._varied:
-            self._scene = self.env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
+            self._scene = self.env.unwrapped.world  # pyrefly: ignore[missing-attribute]
             self._parts = self._parted()
         states = []
         for part in self._parts_of(fresh):

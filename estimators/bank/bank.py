@@ -330,7 +330,7 @@ class IteratedEkfBank:
         if self.volume is None:
             low, high = anchors.min(axis=-2), anchors.max(axis=-2)
         else:
-            low, high = np.broadcast_to(self.volume, (len(rotation), 2, 3)).swapaxes(0, 1)  # pyright: ignore[reportArgumentType]
+            low, high = np.broadcast_to(self.volume, (len(rotation), 2, 3)).swapaxes(0, 1)
         reach = np.maximum(np.linalg.norm(high - low, axis=-1), 1.0)
         variance = np.empty((len(rotation), 6))
         variance[:, :3], variance[:, 3:] = math.pi**2, np.square(reach)[:, None]
@@ -338,7 +338,7 @@ class IteratedEkfBank:
 
     def _is_outside(self, translation: FloatArray, covariance: FloatArray) -> BoolArray:
         """Return whether (...) a position is over three standard deviations outside the volume."""
-        low, high = self.volume  # pyright: ignore[reportGeneralTypeIssues, reportOptionalIterable]
+        low, high = self.volume  # pyrefly: ignore[not-iterable]
         margin = 3 * np.sqrt(np.einsum("...ii->...i", covariance)[..., 3:])
         off = (translation < low - margin) | (translation > high + margin)
         return np.asarray(off.any(axis=-1))

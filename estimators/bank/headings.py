@@ -123,7 +123,7 @@ class HeadingBank:
             raise ValueError(f"{name} must have shape {shape}, got {told.shape}")
         twist = np.expand_dims(told, -1 - trailing)
         steps = np.expand_dims(np.asarray(dt), -2) if np.ndim(dt) else dt
-        moved: AugmentedState = self.filter.predict(_filtered(state), twist, steps)  # pyright: ignore[reportArgumentType]
+        moved: AugmentedState = self.filter.predict(_filtered(state), twist, steps)  # pyrefly: ignore[bad-argument-type]
         return HeadingState(*moved, *state[4:])
 
     def update(
@@ -278,7 +278,7 @@ def iekf_imu(
         gravity_tilt_rad=gravity_tilt_rad,
     )
     found = filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
-    return found  # pyright: ignore[reportReturnType]
+    return found  # pyrefly: ignore[bad-return]
 
 
 register("iekf-imu", iekf_imu)

@@ -186,7 +186,7 @@ class _Rows(NamedTuple):
             return np.concatenate([block for _, block in found], axis=1)
         sides = dict.fromkeys(side for side, _ in found)
         return np.concatenate(
-            [sum(b for side, b in found if side == one) for one in sides],  # pyright: ignore[reportCallIssue, reportArgumentType]
+            [sum(b for side, b in found if side == one) for one in sides],
             axis=1,
         )
 

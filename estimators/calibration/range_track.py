@@ -89,7 +89,7 @@ def range_track(
     )
     losses = [LATE]
     if isinstance(start, scipy.interpolate.BSpline):
-        first = start.c  # pyright: ignore[reportAttributeAccessIssue]
+        first = start.c
     else:
         first, losses = check_array("start", start, (3,)) + np.zeros((m, 3)), [huber(HUBER), LATE]
     x = np.append(first.T, np.zeros(count))

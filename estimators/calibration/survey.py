@@ -271,7 +271,7 @@ def _reduced(
     """Return the normal equations of anchors and biases, and back-substitution data per block."""
     K, L = len(problem.ranges), state.link_m.size
     H, g = _prior(problem, state)
-    pieces = []
+    pieces: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     step = max(1, _PIECE // max(L * len(g), 1))
     for first in range(0, K, step):
         part = slice(first, min(first + step, K))

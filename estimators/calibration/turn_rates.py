@@ -62,7 +62,7 @@ def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
             f"{body.shape}"
         )
     w = np.ones(len(sensor))
-    std, R, bias = 1.0, np.eye(3), np.zeros(3)
+    std, R, bias, left = 1.0, np.eye(3), np.zeros(3), body
     everything = np.ones(sensor.shape, dtype=bool)
     for _ in range(_ROUNDS):
         mean_s, mean_b = (np.average(a, axis=0, weights=w) for a in (sensor, body))

@@ -188,7 +188,7 @@ class AugmentedEkf:
                 found = self._updated(whole, ranges, weights, anchors, start, covariance)
                 start, covariance = found[:2], found.covariance[..., :6, :6]
             count = ranges.shape[-2] * ranges.shape[-1]
-            found = undirected(found, count)  # pyright: ignore
+            found = undirected(found, count)  # pyrefly: ignore[bad-argument-type, unbound-name]
         # A row suffices: all of them are NaN if the pose is not determined.
         as_state(*found[:2], found.covariance[..., 0, :])
         return found
@@ -277,7 +277,7 @@ class AugmentedEkf:
         )  # fmt: skip
         if self.offset is None:
             return AugmentedState(*update_augmented(*epoch))
-        return AugmentedState(*update_augmented.textbook(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
+        return AugmentedState(*update_augmented.textbook(*epoch, self.offset))
 
     def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:
         """Return the state extended by the biases of (M, N) links."""

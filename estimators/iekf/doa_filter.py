@@ -58,7 +58,7 @@ class DoaEkf(IteratedEkf):
         if self.offset is not None:
             raise ValueError(f"offset must be None for angles, got {self.offset!r:.80}")
 
-    def update(  # pyright: ignore[reportIncompatibleMethodOverride]
+    def update(  # pyrefly: ignore[bad-override-param-name]
         self,
         state: PoseState,
         angles: ArrayLike,
@@ -113,7 +113,8 @@ class DoaEkf(IteratedEkf):
             weights = weights * heard[..., None, :]
         loss = huber(HUBER) if self.robust else SQUARES
         measured = (weights > 0).any(axis=-2)
-        data: DoaCost | SumCost = DoaCost(angles, weights, self.tags, station, loss)
+        of_angles = DoaCost(angles, weights, self.tags, station, loss)
+        data: DoaCost | SumCost = of_angles
         if ranges is not None:
             range_law = self.range_noise if range_noise is None else range_noise
             if range_law is None:
@@ -129,7 +130,7 @@ class DoaEkf(IteratedEkf):
             of_ranges = of_ranges if mask is None else of_ranges * mask
             of_late = LATE if self.robust == "late" else loss
             measured = measured | (of_ranges > 0).any(axis=-2)
-            data = SumCost((data, RangeCost(ranges, of_ranges, anchors, self.tags, of_late)))
+            data = SumCost((of_angles, RangeCost(ranges, of_ranges, anchors, self.tags, of_late)))
         problem = map_problem(state, data)
         found = minimize(problem, *self._start(problem, data), self.iterations)
         covariance = positive_inverse(found.at.hessian)

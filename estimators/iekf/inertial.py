@@ -71,7 +71,7 @@ class InertialEkf(AugmentedEkf):
         tilt = [self.gravity_tilt_rad] * (self._n_twist - _NAVIGATION)
         return np.concatenate([[self.speed_m_s] * 3, self.inertial.prior_std, tilt])
 
-    def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
+    def predict(  # pyrefly: ignore[bad-override-param-name]
         self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike
     ) -> AugmentedState:
         """Return the state after the samples of an interval.

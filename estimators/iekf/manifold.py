@@ -201,7 +201,7 @@ class IteratedEkf:
         (rotation, translation, P), tags = state, self.tags
         shares, numbers = links_of_plain_epoch(ranges, anchors, tags, P.shape[:-2]), self._numbers
         if shares is not None and (links is not None or noise is not None):
-            shares, numbers = self._plain_law(ranges, links, noise)  # pyright: ignore[reportArgumentType]
+            shares, numbers = self._plain_law(ranges, links, noise)  # pyrefly: ignore[bad-argument-type]
         if shares is None or numbers is None:
             return None
         # Arguments one by one: unpacking them takes a tenth of the time of the call.

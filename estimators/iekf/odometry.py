@@ -66,7 +66,7 @@ class OdometryEkf(AugmentedEkf):
         assert self.twist is not None
         return np.concatenate([self.twist.prior_std(), self.odometry.calibration_std()])
 
-    def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
+    def predict(  # pyrefly: ignore[bad-override-param-name]
         self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike
     ) -> AugmentedState:
         """Return the state after the readings of an interval.

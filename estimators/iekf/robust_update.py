@@ -34,7 +34,7 @@ def robust_solution(
     successively at `CUTOFFS`. Each stage has so many Gauss-Newton iterations; the problem's own
     loss is ignored.
     """
-    data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
+    data: RangeCost = problem.data  # pyrefly: ignore[bad-assignment]
     data = dataclasses.replace(data, loss=huber(HUBER))
     out = _beyond_gate(problem.prior, data)
     kept = dataclasses.replace(data, weights=np.where(out, 0.0, data.weights))
@@ -66,7 +66,7 @@ def late_solution(
     problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
 ) -> Solution:
     """Return the pose of the redescending loss, started at Huber's; see `robust_solution`."""
-    data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
+    data: RangeCost = problem.data  # pyrefly: ignore[bad-assignment]
     easy = _with(problem, dataclasses.replace(data, loss=huber(HUBER)))
     found = minimize_pose(easy, rotation, translation, iterations, 1e-2)
     hard = _with(problem, dataclasses.replace(data, loss=LATE))

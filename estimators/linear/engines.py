@@ -285,7 +285,7 @@ def _kalman_filter() -> Any:
     from filterpy.kalman import KalmanFilter  # slow to import, and often not needed
 
     kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
-    kf.inv = inverse12  # pyright: ignore[reportAttributeAccessIssue]
+    kf.inv = inverse12  # pyrefly: ignore[bad-assignment]
     # Without B, filterpy silently ignores u.
-    kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])  # pyright: ignore[reportAttributeAccessIssue]
+    kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
     return kf

@@ -1,7 +1,5 @@
 """Beliefs over the poses of a planar network from one epoch, by cycle consensus."""
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 from typing import Any, NamedTuple

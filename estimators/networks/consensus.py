@@ -9,8 +9,6 @@ Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame a
 localization for relative sensing networks". Equation numbers are those of the paper.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportOptionalSubscript=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import Any, NamedTuple
@@ -243,7 +241,7 @@ def cycle_consensus(
         If it does not converge in `max_steps`, or the branches of dependent cycles are
         contradictory.
     """
-    run = cycle_iteration(edges, y, n_nodes, cycles, kappa, **options)  # pyright: ignore[reportArgumentType]
+    run = cycle_iteration(edges, y, n_nodes, cycles, kappa, **options)  # pyrefly: ignore[bad-argument-type]
     if not run.converged:
         why = "" if run.consistent else ": " + _contradiction(run.branch)
         raise RuntimeError(f"the cycle iteration did not converge in {run.steps} steps{why}")
@@ -338,9 +336,9 @@ def cycle_iteration(
             if not _consistent(C, reached):
                 break
             consistent = True
-        heard = np.ones(len(off), dtype=np.bool_) if not loss else rng.random(len(off)) >= loss  # pyright: ignore[reportOptionalMemberAccess]
+        heard = np.ones(len(off), dtype=np.bool_) if not loss else rng.random(len(off)) >= loss  # pyrefly: ignore[missing-attribute]
         if one_by_one:
-            turns = rng.permutation(len(off))  # pyright: ignore[reportOptionalMemberAccess]
+            turns = rng.permutation(len(off))  # pyrefly: ignore[missing-attribute]
             _one_by_one(C, psi, gain, target, turns[heard[turns]])
         else:
             psi -= pull if not loss else transposed @ (gain * off * heard)

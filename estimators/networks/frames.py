@@ -4,8 +4,6 @@ Bearings determine the shape; one known distance, or ranges, determines its scal
 refined by joint maximum likelihood of orientations and positions.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
 from typing import Any, NamedTuple

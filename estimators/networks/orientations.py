@@ -5,8 +5,6 @@ The maximum-likelihood orientations minimise the sum of squared wrapped residual
 one factorised graph Laplacian, for any number of cycles.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportReturnType=false
 from __future__ import annotations
 
 from typing import Any, NamedTuple
@@ -322,4 +320,5 @@ def _factorised(A: scipy.sparse.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any
 
 def _gathered(edges: IntArray, values: FloatArray, n_nodes: int) -> FloatArray:
     """Return ``B^T values`` (n,)."""
-    return np.bincount(edges[:, 1], values, n_nodes) - np.bincount(edges[:, 0], values, n_nodes)
+    into, out = (np.bincount(edges[:, k], values, n_nodes) for k in (1, 0))
+    return into - out  # pyrefly: ignore[bad-return]

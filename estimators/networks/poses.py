@@ -214,7 +214,7 @@ def _linear_start(measured: _Measured, theta: FloatArray, positions: FloatArray)
     n_nodes = theta.shape[-1]
     # A weak prior that keeps unmeasured nodes in place and hardly affects the others.
     prior = _HINT * measured.prior[-1]
-    apart = measured.lengths
+    places, apart = positions, measured.lengths
     for _ in range(_REWEIGHTINGS):
         flat = links / (measured.bearing_std * np.maximum(apart, 0.1 * measured.lengths)) ** 2
         tie = flat[..., None, None] * across[..., :, None] * across[..., None, :]

@@ -9,7 +9,7 @@ The equations are therefore block-tridiagonal with a border.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -215,7 +215,7 @@ def with_turning(rows: Rows, state: LogState) -> Rows:
     The error of the vector is ``dW + w x W``.
     """
     W = _HAT(state.extra[..., :3])
-    ends = []
+    ends: list[Any] = []
     for A, spin in (
         (rows.before, W[..., : rows.before.shape[-3], :, :]),
         (rows.after, W[..., 1:, :, :]),

@@ -70,14 +70,14 @@ class InertialMotion:
     @functools.cached_property
     def _whitener(self) -> FloatArray:
         """Return inverse Cholesky factors (..., K - 1, 9, 9) of the preintegrated noise."""
-        moved = navigation.integrate(self.readings, self.steps, np.zeros(6), self.sensor.numbers)  # pyright: ignore[reportArgumentType]
+        moved = navigation.integrate(self.readings, self.steps, np.zeros(6), self.sensor.numbers)  # pyrefly: ignore[bad-argument-type]
         return np.linalg.inv(np.linalg.cholesky(moved.covariance + LEAST_STD**2 * np.eye(9)))
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
         """Return whitened rows of each epoch less its prediction from the epoch before."""
         Q, Q_new = state.rotation[..., :-1, :, :], state.rotation[..., 1:, :, :]
         x, x_new = state.extra[..., :-1, :9], state.extra[..., 1:, :9]
-        moved = navigation.integrate(self.readings, self.steps, x[..., 3:], self.sensor.numbers)  # pyright: ignore[reportArgumentType]
+        moved = navigation.integrate(self.readings, self.steps, x[..., 3:], self.sensor.numbers)  # pyrefly: ignore[bad-argument-type]
         T = moved.duration[..., None]
         tilt = constants if len(self.constants_std) else np.zeros(2)
         down = navigation.gravity(tilt, float(self.sensor.numbers[4]))[..., None, :]

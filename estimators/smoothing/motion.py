@@ -76,7 +76,7 @@ class KnownTwist:
         dt = np.diff(times)[..., None]
         std = np.sqrt(dt * self.process.std() ** 2 + LEAST_STD**2)
         before, after = _neighbours(state)
-        moved: FloatArray = np.zeros(6) if self.twists is None else self.twists * dt  # pyright: ignore
+        moved: FloatArray = np.zeros(6) if self.twists is None else self.twists * dt  # pyrefly: ignore[bad-assignment, unsupported-operation]
         turn = _EXP(moved[..., :3])
         turned = turn @ before[0]
         error = _LOG(after[0] @ np.swapaxes(turned, -1, -2))

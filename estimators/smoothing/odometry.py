@@ -70,7 +70,7 @@ class OdometryMotion:
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
         """Return whitened rows of the motion between two poses less the integrated readings."""
-        turn, way, by = _together(self.readings, self.steps, constants)  # pyright: ignore[reportArgumentType]
+        turn, way, by = _together(self.readings, self.steps, constants)  # pyrefly: ignore[bad-argument-type]
         Q, Q_new = state.rotation[..., :-1, :, :], state.rotation[..., 1:, :, :]
         back = np.swapaxes(Q, -1, -2)
         error = _LOG(np.swapaxes(turn, -1, -2) @ back @ Q_new)
@@ -91,7 +91,7 @@ class OdometryMotion:
     @functools.cached_property
     def _whitener(self) -> FloatArray:
         """Return inverse Cholesky factors (..., K - 1, 6, 6) of the integrated noise."""
-        _, way, _ = _together(self.readings, self.steps, np.zeros(5))  # pyright: ignore[reportArgumentType]
+        _, way, _ = _together(self.readings, self.steps, np.zeros(5))  # pyrefly: ignore[bad-argument-type]
         steps = np.asarray(self.steps)[..., None]
         known = np.isfinite(np.asarray(self.readings))
         unread = np.repeat(self.unread, 3)

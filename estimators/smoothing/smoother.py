@@ -213,10 +213,9 @@ def smooth(
     """
     iterations = check_count("iterations", iterations)
     problem, state = _checked(log, model, prior, start)
-    losses = [model.loss] if _is_convex(model.loss) else [huber(HUBER), model.loss]
-    for loss in losses:
-        tolerance = _TOLERANCE if loss is losses[-1] else _COARSE
-        state, equations, converged = problem.minimize(state, loss, iterations, tolerance)
+    if not _is_convex(model.loss):
+        state, _, _ = problem.minimize(state, huber(HUBER), iterations, _COARSE)
+    state, equations, converged = problem.minimize(state, model.loss, iterations, _TOLERANCE)
     covariances = equations.covariances()
     P, _, constants = covariances
     if not np.isfinite(P).all():
@@ -224,12 +223,12 @@ def smooth(
             "log and prior must determine every state, but some have no information: give a "
             "finite prior covariance, or more ranges"
         )
-    squares, freedom = problem.ranges.consistency(state, losses[-1], covariances)
+    squares, freedom = problem.ranges.consistency(state, model.loss, covariances)
     if model.motion.turning:
         P = _of_errors(P, state)
     e = 6 + len(model.motion.extra_std)
     shape = problem.ranges.shape
-    residuals = problem.ranges.spread(-problem.ranges.residual(state, losses[-1])[0])
+    residuals = problem.ranges.spread(-problem.ranges.residual(state, model.loss)[0])
     biases = bias_of(problem.ranges.blocks, state, shape[0] * shape[1])
     return Smoothed(
         state.rotation, state.translation, P[..., :6, :6],
@@ -373,7 +372,7 @@ def _checked(
     M, N = ranges.shape[-2:]
     constants = sum(len(factor.constants_std) for factor in (motion, *factors))
     blocks, extra, constants = bias_blocks(model.biases, M * N, len(motion.extra_std), constants)
-    clocks, first = None, extra
+    clocks, found, first = None, None, extra
     if model.clock is not None:
         block = clock_block(model.clock, (M, N), extra)
         there = np.broadcast_to(True if mask is None else mask, ranges.shape)
@@ -385,8 +384,8 @@ def _checked(
         layout = Layout(model.directions, anchors, model.tags)
         gathered = dataclasses.replace(gathered, layout=layout)
     state = LogState(Q, t, np.zeros((*batch, K, extra)), np.zeros((*batch, constants)))
-    if clocks is not None:
-        state.extra[..., first : first + found.shape[-1]] = found  # pyright: ignore[reportPossiblyUnboundVariable]
+    if found is not None:
+        state.extra[..., first : first + found.shape[-1]] = found
     pose = PoseState(rotation, translation, covariance)
     information = positive_inverse(covariance)
     return _Problem(times, gathered, motion, factors, pose, information, clocks), state

@@ -46,7 +46,7 @@ def causal_track(
         )
     ranges, anchors = np.asarray(log.ranges, float), np.asarray(log.anchors, float)
     twists = np.zeros((len(times) - 1, 6)) if twists is None else np.asarray(twists, float)
-    state: Any = filter.initial(*prior)  # pyright: ignore[reportArgumentType]
+    state: Any = filter.initial(*prior)
     beliefs = []
     for k, time in enumerate(times):
         if k > 0 and time > times[k - 1]:

@@ -42,10 +42,11 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, with a suggestion for a misspelt name."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**{"formatter_class": _Help, **kwargs})
+        kwargs.setdefault("formatter_class", _Help)
+        super().__init__(**kwargs)
         self._typed: list[str] = []
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; raise an error here for an unknown option, so that it names the command."""
         self._typed = [*(sys.argv[1:] if args is None else args)]
         options, unknown = super().parse_known_args(args, namespace)

@@ -194,10 +194,10 @@ def box(text: str) -> list[tuple[float | None, float | None]] | None:
         axis, _, ends = part.strip().partition("=")
         low, colon, high = ends.partition(":")
         try:
-            pair = tuple(float(end) if end.strip() else None for end in (low, high))
+            pair = [float(end) if end.strip() else None for end in (low, high)]
         except ValueError:
-            colon = ""
-        if not colon or axis not in ("x", "y", "z") or axis in limits:
+            pair = []
+        if not (colon and pair) or axis not in ("x", "y", "z") or axis in limits:
             raise argparse.ArgumentTypeError(
                 f"must be {BOX} in metres, each axis once, got {text!r}"
             )

@@ -117,7 +117,7 @@ def _curves(result: dict[str, Any]) -> go.Figure:
                 col=column + 1,
             )
     shown.update_xaxes(range=[0.5, steps[-1] + 0.5])
-    shown.add_hrect(low, high, row=2, col=2, line_width=0, fillcolor="#868e96", opacity=0.25)  # pyright: ignore[reportArgumentType]
+    shown.add_hrect(low, high, row=2, col=2, line_width=0, fillcolor="#868e96", opacity=0.25)
     shown.update_xaxes(title_text="time step", title_standoff=4)
     shown.update_annotations(font_size=13)
     legend = {"orientation": "h", "x": 0, "y": 1.06, "yanchor": "bottom"}

@@ -183,7 +183,7 @@ def information_at(
     if numbers is None:
         form = _range_information if anchor_std is None else _surveyed_information
         last = offset if anchor_std is None else anchor_std
-        return form(anchors, tags, rotation, translation, noise, share, last)  # pyright: ignore[reportArgumentType]
+        return form(anchors, tags, rotation, translation, noise, share, last)  # pyrefly: ignore[bad-argument-type]
     links = anchors.shape[-2], tags.shape[-2]
     if share.shape[-2:] != links:
         share = np.broadcast_to(share, (*share.shape[:-2], *links))

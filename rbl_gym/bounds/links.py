@@ -81,7 +81,7 @@ def expected_information(
         share = share * nlos_efficiency(
             link_model.nlos_probability, link_model.nlos_bias_m, std, nlos_std_m, known=nlos_known
         )
-    return bounds.information_at(*places, noise, share)  # pyright: ignore[reportArgumentType]
+    return bounds.information_at(*places, noise, share)
 
 
 def realised_crb(

@@ -172,7 +172,7 @@ def epoch_information(epoch: RangeEpoch, nuisances: Nuisances | None = None) -> 
         As in `bounds.range_information`.
     """
     epoch, nuisances = RangeEpoch(*epoch).checked(), nuisances or Nuisances()
-    return information_of(epoch, nuisances, epoch.links)  # pyright: ignore[reportArgumentType]
+    return information_of(epoch, nuisances, epoch.links)  # pyrefly: ignore[bad-argument-type]
 
 
 def information_of(

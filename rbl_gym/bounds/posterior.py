@@ -111,7 +111,7 @@ def step_of_angles(
 
 
 def _predicted(prior: FloatArray, twist: FloatArray, dt: ArrayLike, std: FloatArray) -> FloatArray:
-    process = ProcessNoise(std[..., :3], std[..., 3:])  # pyright: ignore[reportArgumentType]
+    process = ProcessNoise(std[..., :3], std[..., 3:])  # pyrefly: ignore[bad-argument-type]
     return predict_information(prior, twist, dt, process)
 
 

@@ -63,7 +63,7 @@ def posterior_step(
             )
         rows = nuisances.bias_rows(anchors, tags)
         J = nuisances.faded(J, 0 if rows is None else len(rows), motion.seconds)
-    told = information_of(epoch, nuisances, epoch.links)  # pyright: ignore[reportArgumentType]
+    told = information_of(epoch, nuisances, epoch.links)  # pyrefly: ignore[bad-argument-type]
     return with_epoch(J, told, states)
 
 

@@ -58,7 +58,7 @@ class StatedLength:
         self._spec = spec
 
 
-class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):
     """Base class of environments with many worlds in arrays.
 
     Seeding: ``reset(seed=s)`` seeds world i with ``s + i``. A list gives each world its own seed.
@@ -96,7 +96,8 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
             autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.steps_limit = min(steps, max_episode_steps or steps)
+        # One for all worlds; environments of families make it an array.
+        self.steps_limit: Any = min(steps, max_episode_steps or steps)
         self.metadata = {
             "render_modes": rendering.RENDER_MODES,
             "render_fps": self.render_fps,

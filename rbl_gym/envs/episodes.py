@@ -97,14 +97,14 @@ class EpisodeStore:
         """Return the epochs (B,) of all worlds; the random numbers must not be written to."""
         where = self._where(epochs)
         random = [None if field is None else field[where] for field in self._timed[3:]]
-        return simulation.Epoch(*self._motion(where), *random)  # pyright: ignore[reportArgumentType]
+        return simulation.Epoch(*self._motion(where), *random)  # pyrefly: ignore[bad-argument-type]
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
         """Return copies of the motion of all worlds at their epochs (B,)."""
         return self._motion(self._where(epochs))
 
     def _motion(self, where: Any) -> simulation.Motion:
-        return simulation.Motion(*[np.array(field[where]) for field in self._timed[:3]])  # pyright: ignore[reportOptionalSubscript]
+        return simulation.Motion(*[np.array(field[where]) for field in self._timed[:3]])  # pyrefly: ignore[unsupported-operation]
 
     def _where(self, epochs: np.ndarray) -> Any:
         if self._num_envs == 1 or (epochs == epochs[0]).all():

@@ -228,7 +228,8 @@ class PlanarNetworkVectorEnv(BatchEnv):
         return reward, np.zeros(self.num_envs, dtype=np.bool_)
 
     def _observe(self) -> dict[str, np.ndarray]:
-        seen = {"bearings": self._bearings.copy(), "links": self._links.astype(np.int8)}
+        links = self._links.astype(np.int8)
+        seen: dict[str, np.ndarray] = {"bearings": self._bearings.copy(), "links": links}
         if self.lengths != "none":
             seen["lengths"] = self._lengths.copy()
         if self.family is not None:

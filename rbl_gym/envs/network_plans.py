@@ -111,7 +111,7 @@ def sensing_of(plans: Sequence[NetworkPlan]) -> Sensing:
         name: np.array([getattr(one, name) for one in each])[:, None, None]
         for name in ("bearing_std_rad", "length_std_m", "prior_std_rad", "prior_std_m")
     }
-    return Sensing(**fields, typical_length_m=(mean, std))  # pyright: ignore
+    return Sensing(**fields, typical_length_m=(mean, std))  # pyrefly: ignore[bad-argument-type]
 
 
 def _ring(low: float, high: float) -> tuple[float, float]:
@@ -175,7 +175,8 @@ class NetworkFamily:
             }
             for one in self.members
         ]
-        return NetworkPlan(**{name: max(end[name] for end in ends) for name in _NAMES})
+        largest: dict[str, Any] = {name: max(end[name] for end in ends) for name in _NAMES}
+        return NetworkPlan(**largest)
 
     def draw(self, rng: np.random.Generator) -> tuple[NetworkPlan, dict[str, Any]]:
         """Draw a network; return it with the fields of its member."""

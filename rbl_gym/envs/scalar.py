@@ -15,7 +15,7 @@ from rbl_gym.envs.batch import BatchEnv, Observation, StatedLength, check_action
 _FIRST, _ALONE = np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.bool_)
 
 
-class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class ScalarEnv(StatedLength, gym.Env[Any, Any]):
     """One world of a `BatchEnv`, as a scalar environment.
 
     A subclass sets its `batch_class`. Its ``__init__`` passes the arguments to `_configure`.

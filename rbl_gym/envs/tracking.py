@@ -32,7 +32,7 @@ _FAR = 1e9
 # compares it with world i of the vector environment.
 
 
-class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class TrackingEnv(StatedLength, gym.Env[Any, Any]):
     """A rigid body moves, and anchors measure noisy ranges to its tags.
 
     ## Description
@@ -252,7 +252,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         bound = None if known is None else scene_bounds.pose_covariance(known)[None]
         world = links.view(np.bool_)[None], self._anchors[None], at.rotation[None]
         shot = rendering.shot(*world, at.translation[None], bound)
-        self.film.take([self._epoch], shot)  # pyright: ignore[reportOptionalMemberAccess]
+        self.film.take([self._epoch], shot)  # pyrefly: ignore[missing-attribute]
 
     def render(self) -> Any:
         """Return an RGB frame, uint8: the world, a close-up, and the errors (or the bound)."""

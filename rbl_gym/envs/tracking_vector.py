@@ -71,11 +71,11 @@ class TrackingVectorEnv(BatchEnv):
             else FamilyStore(self.family, num_envs, self._in_turn)
         )
         self._longest = self.steps_limit
-        self._anchors = np.zeros((num_envs, worlds.n_anchors, 3))
+        self._anchors: FloatArray = np.zeros((num_envs, worlds.n_anchors, 3))
         self._prior_covariance = np.empty((num_envs, 6, 6))
         size = 6 if self.family is not None else scene_bounds.information_size(self.scene)
-        self._information = np.empty((num_envs, size, size))
-        self._score_m = np.empty(num_envs)
+        self._information: FloatArray = np.empty((num_envs, size, size))
+        self._score_m: FloatArray = np.empty(num_envs)
         self._seen: tuple[simulation.Epoch, dict[str, np.ndarray]] | None = None
 
     @property
@@ -131,7 +131,7 @@ class TrackingVectorEnv(BatchEnv):
         """
         if self._seen is None:
             at = self._episodes.at(self._epochs)
-            self._seen = at, observed(self.world, at, self._anchors)  # pyright: ignore[reportArgumentType]
+            self._seen = at, observed(self.world, at, self._anchors)  # pyrefly: ignore[bad-argument-type]
         return self._seen
 
     def _observe(self) -> dict[str, np.ndarray]:
@@ -177,7 +177,7 @@ class TrackingVectorEnv(BatchEnv):
         anchors, links = self._anchors, told["links"].view(np.bool_)
         information, prior = self._information, self._prior_covariance
         if len(rows) < self.num_envs:
-            at = simulation.Epoch(*(None if field is None else field[rows] for field in at))  # pyright: ignore[reportArgumentType]
+            at = simulation.Epoch(*(None if field is None else field[rows] for field in at))  # pyrefly: ignore[bad-argument-type]
             anchors, links = anchors[rows], links[rows]
             information, prior = information[rows], prior[rows]
         information, score_m = self._bound_of(
@@ -204,8 +204,8 @@ class TrackingVectorEnv(BatchEnv):
         information, score = np.empty((len(rows), 6, 6)), np.empty(len(rows))
         for count, alike in stack.bodies():
             information[alike], score[alike] = scene_bounds.posterior_step(
-                stack.rows(alike).with_tags(count),  # pyright: ignore[reportArgumentType]
-                simulation.Epoch(*(None if f is None else f[alike] for f in at)),  # pyright: ignore[reportArgumentType]
+                stack.rows(alike).with_tags(count),  # pyrefly: ignore[bad-argument-type]
+                simulation.Epoch(*(None if f is None else f[alike] for f in at)),  # pyrefly: ignore[bad-argument-type]
                 anchors[alike],
                 links[alike, :, :count],
                 None if previous is None else previous[alike],

@@ -38,7 +38,7 @@ class Mounts(Region):
 
     pieces: FloatArray
     piece_face: np.ndarray
-    faces: Faces  # pyright: ignore[reportIncompatibleVariableOverride]
+    faces: Faces
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper corner (3,) of the bounding box."""

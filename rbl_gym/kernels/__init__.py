@@ -96,7 +96,7 @@ class Compiled:
         return self._run
 
     def __reduce__(self) -> str:
-        return self.__qualname__  # pyright: ignore[reportAttributeAccessIssue]
+        return self.__qualname__  # pyrefly: ignore[missing-attribute]
 
 
 def compiled(name: str) -> Callable[[Callable[..., Any]], Compiled]:

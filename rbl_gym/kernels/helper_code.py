@@ -104,7 +104,7 @@ def types_remembered() -> Iterator[None]:
 
 def _is_plain(kind: Any) -> bool:
     if isinstance(kind, BaseTuple):
-        return all(map(_is_plain, kind))  # pyright: ignore[reportArgumentType]
+        return all(map(_is_plain, kind))  # pyrefly: ignore[bad-argument-type]
     return isinstance(kind, (Number, Boolean, Array))
 
 
@@ -125,7 +125,7 @@ def as_code() -> Iterator[None]:
 
     Compilations in other threads wait.
     """
-    if Compiler is None:
+    if _target is None or _lock is None:
         yield
         return
     codegen = _target.target_context.codegen()
@@ -139,7 +139,7 @@ def as_code() -> Iterator[None]:
 
 if Compiler is not None:
 
-    class _Code(JITCodeLibrary):  # pyright: ignore[reportGeneralTypeIssues]
+    class _Code(JITCodeLibrary):  # pyrefly: ignore[invalid-inheritance]
         """Functions as LLVM code; the libraries that link them generate machine code."""
 
         @property
@@ -176,7 +176,7 @@ if Compiler is not None:
             with _optimizing(3):
                 super()._optimize_final_module()
 
-    class _HelperCompiler(Compiler):  # pyright: ignore[reportGeneralTypeIssues]
+    class _HelperCompiler(Compiler):
         library = _Code
 
         def define_pipelines(self) -> Any:

@@ -223,7 +223,7 @@ def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
             # The wrapper of numba around NumPy's ufunc takes a microsecond per call.
             return getattr(made, "ufunc", made)
 
-        function.build = build  # pyright: ignore[reportFunctionMemberAccess]
+        function.build = build  # pyrefly: ignore[missing-attribute]
         return function
 
     return decorate

@@ -32,7 +32,7 @@ def square_and_gradient(
     # The gain of each link at a pose and its derivative, and its information with the gain.
     gains, shares = np.empty((n_tags, n_anchors, 4)), np.empty((n_anchors, n_tags))
     limited = gain[0] < math.inf or gain[2] > -2
-    total = 0.0
+    total = x = y = z = 0.0
     for m in range(n_anchors):
         for i in range(3):
             gradient[m, i] = 0.0

@@ -271,7 +271,7 @@ def most_likely(
     weights = np.empty(shares.shape)
     kept, tolerance = weights, 1e-6
     squared = kept
-    links = 0
+    links, total = 0, math.nan
     sound = weigh(ranges, shares, law, anchors, offset != 0, weights)
     if not (sound and invert(P0, L, information)):
         copy_pose(Q0, t0, Q, t)
@@ -284,7 +284,7 @@ def most_likely(
     if robust == GATED:
         squared, kept = np.empty(weights.shape), np.empty(weights.shape)
         for m in range(weights.shape[0]):
-            for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
+            for n in range(weights.shape[1]):
                 kept[m, n] = weights[m, n]
                 links += weights[m, n] > 0
         squared_residuals_of(Q0, t0, ranges, weights, anchors, tags, loss, offset, squared)
@@ -330,7 +330,7 @@ def most_likely(
         if offset != 0:
             squared_residuals_of(Q, t, ranges, kept, anchors, tags, loss, offset, squared)
         for m in range(weights.shape[0]):
-            for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
+            for n in range(weights.shape[1]):
                 if kept[m, n] > 0:
                     of_prior -= loss_of(squared[m, n], False, loss)[0]
         loss[CUTOFF] = GATE

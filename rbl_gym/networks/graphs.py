@@ -3,8 +3,6 @@
 Graphs are multigraphs: every row of `edges` (m, 2) is a separate edge.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ rigid one, whose rigidity matrix has rank 2 n - 3. In space, bearings do not det
 about the line of sight, unless triangles do.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportOptionalSubscript=false, reportOperatorIssue=false
 from __future__ import annotations
 
 from typing import NamedTuple

@@ -8,8 +8,6 @@ Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame a
 localization for relative sensing networks". Equation numbers are those of the paper.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import math
@@ -66,7 +64,7 @@ def proj(angle: ArrayLike) -> FloatArray:
 
 def check_pair(name: str, pair: ArrayLike, n_nodes: int) -> tuple[int, int]:
     """Return a pair of nodes, or raise ValueError."""
-    pairs = check_edges([pair], n_nodes, name)  # pyright: ignore[reportArgumentType]
+    pairs = check_edges([pair], n_nodes, name)  # pyrefly: ignore[bad-argument-type]
     if not len(pairs):
         raise ValueError(f"{name} must be two nodes, got {pair!r:.80}")
     return int(pairs[0, 0]), int(pairs[0, 1])
@@ -93,7 +91,7 @@ def unit_disk_edges(positions: ArrayLike, radius_m: float, blind_m: float = 0.0)
     positions = check_positions(positions)
     radius_m = check_number("radius_m", radius_m, low=0.0)
     pairs = np.sort(
-        scipy.spatial.cKDTree(positions).query_pairs(radius_m, output_type="ndarray"), axis=1
+        scipy.spatial.KDTree(positions).query_pairs(radius_m, output_type="ndarray"), axis=1
     )
     if blind_m > 0:
         apart = np.linalg.norm(positions[pairs[:, 1]] - positions[pairs[:, 0]], axis=1)

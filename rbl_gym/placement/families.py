@@ -211,7 +211,7 @@ class StackedTasks:
             )
             if self.family.most_boxes:
                 blocked = self.arrays.blocked[own]
-                share = share * Obstacles(problem.racks, blocked).share(anchors[alike], places)  # pyright: ignore[reportArgumentType]
+                share = share * Obstacles(problem.racks, blocked).share(anchors[alike], places)
             square[alike] = mean_square(
                 anchors[alike], self._poses[0], places, self.arrays.tags[own, :count],
                 self.arrays.prior[own], self.arrays.laws[own], share,

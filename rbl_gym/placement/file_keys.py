@@ -71,8 +71,8 @@ class Table(NamedTuple):
     many: bool = False
 
 
-def _metres(doc: str, **more: Any) -> Key:
-    return Key("number", doc, **{"low": -MOST_M, "high": MOST_M, **more})
+def _metres(doc: str, low: float = -MOST_M, high: float = MOST_M, **more: Any) -> Key:
+    return Key("number", doc, low=low, high=high, **more)
 
 
 def _size(doc: str, **more: Any) -> Key:

@@ -72,7 +72,7 @@ def _form_schema(form: Form) -> dict[str, Any]:
 
 
 def _key_schema(key: Key) -> dict[str, Any]:
-    found = {"description": key.doc, **_TYPES[key.kind]}
+    found: dict[str, Any] = {"description": key.doc, **_TYPES[key.kind]}
     if key.choices:
         found = {"description": key.doc, "enum": list(key.choices)}
     if key.low > -math.inf:

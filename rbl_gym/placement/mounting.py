@@ -124,7 +124,7 @@ def _pieces(shapely: Any, mount: Mount, covers: _Solids, bans: _Solids) -> list[
         np.concatenate([near.low - ahead[2], bans.low]),
         np.concatenate([near.high - ahead[2], bans.high]),
     )
-    rows = []
+    rows: list[list[float]] = []
     for bottom, top, left in _layers(shapely, shape, mount, solids):
         for corners in _simplices(shapely, left):
             rows.append([*corners.ravel(), bottom, top])

@@ -24,7 +24,7 @@ __all__ = ["of_problem", "of_task"]
 SHOWN, FOR_SWAPS = {"walls": 48, "mounts": 160}, {"walls": 400, "mounts": 160}
 # Number of positions to judge candidates of a building.
 PLACES = 64
-_KINDS = {Box: "box", Shell: "shell", Walls: "walls"}
+_KINDS: dict[type, str] = {Box: "box", Shell: "shell", Walls: "walls"}
 
 
 def of_task(task: PlacementTask, context: Context, for_swaps: bool = False) -> Scenery:

@@ -46,7 +46,7 @@ def segments(line: FloatArray, closed: bool) -> list[tuple[FloatArray, FloatArra
 
 def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]:
     """Return quadrilaterals (4, 2) around the pieces of a line, mitred at their joints."""
-    found = []
+    found: list[FloatArray] = []
     parts = segments(line, closed)
     along = np.array([(end - start) / np.hypot(*(end - start)) for start, end in parts])
     for i, (start, end) in enumerate(parts):

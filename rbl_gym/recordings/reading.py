@@ -189,8 +189,8 @@ def _carried(
         said.drop("where the carrier's pose is not known", lost)
         said.note(path, f"{lost} ranges are left out where the carrier's pose is not known")
     std = None if log.range_std is None else log.range_std[known]
-    kept = [a[known] for a in (log.times, log.ranges, log.links)]
-    log = log._replace(times=kept[0], ranges=kept[1], links=kept[2], range_std=std)
+    times, ranges, links = log.times[known], log.ranges[known], log.links[known]
+    log = log._replace(times=times, ranges=ranges, links=links, range_std=std)
     return log, places[known]
 
 

@@ -139,12 +139,12 @@ def _curves(
     if not rows:
         return errors, bands
     rotation, translation, covariance = (
-        np.array([shown[k][field][world] for k in rows])  # pyright: ignore[reportOptionalSubscript]
+        np.array([shown[k][field][world] for k in rows])  # pyrefly: ignore[unsupported-operation]
         for field in range(3)
     )
     bands[:, rows] = 3 * _lengths(np.diagonal(covariance, axis1=-2, axis2=-1))
     if of_belief:
-        true = (np.array([truth[k][field][world] for k in rows]) for field in range(2))  # pyright: ignore[reportOptionalSubscript]
+        true = (np.array([truth[k][field][world] for k in rows]) for field in range(2))  # pyrefly: ignore[unsupported-operation]
         errors[:, rows] = _lengths(metrics.pose_error(rotation, translation, *true) ** 2)
     return errors, bands
 

@@ -85,7 +85,7 @@ class Step(NamedTuple):
     reading: Reading
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # pyrefly: ignore[bad-override]
         """The number of epochs."""
         return 1
 

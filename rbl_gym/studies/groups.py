@@ -31,7 +31,7 @@ class Steps(NamedTuple):
     reading: Reading
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # pyrefly: ignore[bad-override]
         """The number of epochs."""
         return len(self.belief.translation)
 
@@ -218,4 +218,4 @@ def _part(log: Reading, index: Any) -> Reading:
     links, twist = (None if a is None else a[index] for a in (log.links, log.twist))
     law, dt = log.noise, np.broadcast_to(log.dt, len(log.ranges))[index]
     law = LinkNoise(law.std_m[index]) if isinstance(law, LinkNoise) else law
-    return Reading(log.ranges[index], log.anchors[index], links, law, twist, dt)  # pyright: ignore[reportArgumentType]
+    return Reading(log.ranges[index], log.anchors[index], links, law, twist, dt)

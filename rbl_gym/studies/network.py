@@ -1,7 +1,5 @@
 """rbl-gym network: solve the orientations of a planar network or pose graph from a file."""
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import time

@@ -12,7 +12,7 @@ that says what the estimator did and what it should do. They import no estimator
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -105,7 +105,7 @@ def check_locator(locate: Callable[..., Any], *, skip: Sequence[str] = (), seed:
 
 
 def _try_all(
-    checks: dict[str, Callable[[Any, np.random.Generator], None]],
+    checks: Mapping[str, Callable[[Any, np.random.Generator], None]],
     subject: Callable[..., Any],
     skip: Sequence[str],
     seed: int,

@@ -89,7 +89,7 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
         raise ValueError(f"{path} has only one kind: leave out kind, got {value['kind']!r}")
     forms = NOISE_FORMS if kinds is NOISE_LAWS else kinds
     kind = forms[check_one_of(f"{path}.kind", value["kind"], list(forms))]
-    given = {key: item for key, item in value.items() if key != "kind"}
+    given: dict[str, Any] = {key: item for key, item in value.items() if key != "kind"}
     fields = inspect.signature(kind).parameters
     _check_fields(given, fields, path)
     missing = [k for k, p in fields.items() if p.default is p.empty and k not in given]

@@ -23,6 +23,7 @@ from rbl_gym.geometry.obstacles import NO_PRISMS, Obstacles, Prisms, check_obsta
 from rbl_gym.geometry.regions import REGIONS, Box, Region
 from rbl_gym.measurements import inertial
 from rbl_gym.measurements.gain import EVERYWHERE, Gain
+from rbl_gym.measurements.inertial import InertialSensor
 from rbl_gym.measurements.ranging import NOISE_LAWS, LinkModel, NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -156,7 +157,7 @@ class Scene:
     start_translation: tuple[float, float, float] | None = None
     start_volume: Box | None = None
     prior: str = "drawn"
-    inertial: inertial.InertialSensor | None = None
+    inertial: InertialSensor | None = None
     survey_std_m: float = 0.0
 
     def __post_init__(self) -> None:

@@ -296,12 +296,12 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
     """Return views of an episode at one epoch, the same for the whole batch."""
     batch = episode.rotation.ndim - 3
     at: Any = (slice(None),) * batch + (epoch,) if batch else epoch
-    return Epoch(*[None if field is None else field[at] for field in episode[:_TIMED]])  # pyright: ignore[reportArgumentType]
+    return Epoch(*[None if field is None else field[at] for field in episode[:_TIMED]])  # pyrefly: ignore[bad-argument-type]
 
 
 def whole(episode: Episode) -> Epoch:
     """Return all epochs of an episode at once: the time axis is the last batch axis."""
-    return Epoch(*episode[:_TIMED])  # pyright: ignore[reportArgumentType]
+    return Epoch(*episode[:_TIMED])  # pyrefly: ignore[bad-argument-type]
 
 
 def measure_epoch(

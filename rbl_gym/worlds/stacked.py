@@ -161,7 +161,7 @@ class StackedScenes:
         prisms, blocked = self.scenes[0].prisms, self.arrays.blocked
         if len(prisms):
             blocked = blocked[:, 0, 0]
-        return Obstacles(self.arrays.boxes, blocked, prisms)  # pyright: ignore[reportArgumentType]
+        return Obstacles(self.arrays.boxes, blocked, prisms)  # pyrefly: ignore[bad-argument-type]
 
     @functools.cached_property
     def noise(self) -> StackedNoise:
@@ -172,7 +172,7 @@ class StackedScenes:
     def process(self) -> ProcessNoise:
         """The process noise of each scene."""
         std = self.arrays.process
-        return ProcessNoise(std[:, :3], std[:, 3:])  # pyright: ignore[reportArgumentType]
+        return ProcessNoise(std[:, :3], std[:, 3:])  # pyrefly: ignore[bad-argument-type]
 
     @functools.cached_property
     def links(self) -> StackedLinks:

@@ -213,15 +213,15 @@ def tables_of(problem: Problem) -> dict[str, Any]:
     Raises ValueError for mounts or prisms, which only its own file can describe.
     """
     mounts, noise = problem.mounts, problem.noise
-    kinds = {Walls: "room", Box: "box", Shell: "shell"}
+    kinds: dict[type, str] = {Walls: "room", Box: "box", Shell: "shell"}
     if type(mounts) not in kinds or len(problem.obstacles.prisms):
         raise ValueError(
             "a problem with mounts or prisms can only be saved if it comes from a file: pass "
             "tables, the content of that file"
         )
-    fields: Any = dataclasses.asdict(mounts)  # pyright: ignore[reportArgumentType]
+    fields: Any = dataclasses.asdict(mounts)  # pyrefly: ignore[bad-argument-type]
     law = next(name for name, law in NOISE_LAWS.items() if type(noise) is law)
-    values: Any = dataclasses.asdict(noise)  # pyright: ignore[reportArgumentType]
+    values: Any = dataclasses.asdict(noise)  # pyrefly: ignore[bad-argument-type]
     boxes = problem.obstacles.boxes
     tables: dict[str, Any] = {
         "name": problem.name,

@@ -138,7 +138,7 @@ def slice_map(state: State, cells: int = COARSE, before: SliceMap | None = None)
 
 def _shown(errors: Errors, quantity: str, zone: object) -> FloatArray:
     if quantity == "requirement":
-        return relative_errors(errors, limits_of(zone))  # pyright: ignore[reportArgumentType]
+        return relative_errors(errors, limits_of(zone))  # pyrefly: ignore[bad-argument-type]
     shown = QUANTITIES[quantity]
     return shown.scale * getattr(errors, shown.field)
 

@@ -59,7 +59,7 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
     serve = server.serve
     if host in ("127.0.0.1", "localhost", "::1"):
-        server.serve = functools.partial(serve, origins=[_LOOPBACK, None])  # type: ignore
+        server.serve = functools.partial(serve, origins=[_LOOPBACK, None])  # pyrefly: ignore[bad-assignment]
     try:
         yield
     finally:

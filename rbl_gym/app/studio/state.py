@@ -329,7 +329,7 @@ def redo(state: State) -> State:
     return dataclasses.replace(state, layout=layout, past=past, future=tuple(future))
 
 
-def turn_knobs(state: State, **knobs: float) -> State:
+def turn_knobs(state: State, **knobs: Any) -> State:
     """Change `Knobs`, given by name."""
     changed: Knobs = state.world.knobs._replace(**knobs)
     return dataclasses.replace(state, world=state.world.with_knobs(changed))

@@ -50,7 +50,7 @@ def knobs_of(problem: Problem) -> Knobs:
 
 def noise_field(problem: Problem) -> str:
     """Return the name of the constant term of the problem's noise law: its first length."""
-    fields: Any = dataclasses.fields(problem.noise)  # pyright: ignore[reportArgumentType]
+    fields: Any = dataclasses.fields(problem.noise)  # pyrefly: ignore[bad-argument-type]
     return next(field.name for field in fields if field.name.endswith("_m"))
 
 

@@ -340,7 +340,8 @@ class _Maker:
             ]
 
         taken: set[str] = set()
-        for zone in self.found["zones"]:
+        zones: list[dict[str, Any]] = self.found["zones"]
+        for zone in zones:
             name, count = zone["name"], 2
             while zone["name"] in taken:
                 zone["name"], count = f"{name} {count}", count + 1

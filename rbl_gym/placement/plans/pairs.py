@@ -48,7 +48,7 @@ def centre_lines(
         # Intervals along segment i that are free on both segments.
         sign = 1.0 if along[i] @ along[j] > 0 else -1.0
         shift = float((start[j] - start[i]) @ along[i])
-        other = [tuple(sorted((shift + sign * a, shift + sign * b))) for a, b in free[j]]
+        other = [_ordered(shift + sign * a, shift + sign * b) for a, b in free[j]]
         common = [
             (max(a, c), min(b, d))
             for a, b in free[i]
@@ -65,9 +65,9 @@ def centre_lines(
             line = start[i] + np.array([[first], [last]]) * along[i] + middle * normal[i]
             pairs.append((line, distance))
             free[i] = _without(free[i], low, high)
-            ends = sorted((sign * (low - shift), sign * (high - shift)))
+            ends = _ordered(sign * (low - shift), sign * (high - shift))
             free[j] = _without(free[j], *ends)
-            other = [tuple(sorted((shift + sign * a, shift + sign * b))) for a, b in free[j]]
+            other = [_ordered(shift + sign * a, shift + sign * b) for a, b in free[j]]
     single = [
         start[i] + np.array([[a], [b]]) * along[i]
         for i, pieces in enumerate(free)
@@ -75,6 +75,10 @@ def centre_lines(
         if b - a > widest
     ]
     return pairs, single
+
+
+def _ordered(one: float, other: float) -> Piece:
+    return min(one, other), max(one, other)
 
 
 def _goes_on(one: list[Piece], other: list[Piece], place: float) -> bool:

@@ -132,7 +132,7 @@ def is_recording(spec: str | Mapping[str, Any]) -> bool:
 def digest_of(spec: str | Mapping[str, Any]) -> str:
     """Return the hash of a scene, or of a recording with its files."""
     if is_recording(spec):
-        return recordings.load_recording(spec).digest  # pyright: ignore[reportArgumentType]
+        return recordings.load_recording(spec).digest  # pyrefly: ignore[bad-argument-type]
     return worlds.scene_hash(scenes.get(spec))
 
 
@@ -157,7 +157,7 @@ def run_task(task: Task) -> list[tuple[dict[str, Any], float | None]]:
     Every filter runs on the same world.
     """
     if is_recording(task.scene):
-        stage = stages.recording_stage(task.scene, task.condition, task.seed)  # pyright: ignore[reportArgumentType]
+        stage = stages.recording_stage(task.scene, task.condition, task.seed)  # pyrefly: ignore[bad-argument-type]
     else:
         stage = stages.scene_stage(task.scene, task.condition, task.trials, task.seed)
     results = []

@@ -119,9 +119,8 @@ def _told(
     if condition == "anchor-off":
         return scene, off_by(anchors, ANCHOR_ERROR_M, rng)
     if condition == "tag-off":
-        return dataclasses.replace(
-            scene, tags=off_by(np.array(scene.tags), TAG_ERROR_M, rng)
-        ), anchors
+        tags: Any = off_by(np.array(scene.tags), TAG_ERROR_M, rng)
+        return dataclasses.replace(scene, tags=tags), anchors
     return scene, anchors
 
 

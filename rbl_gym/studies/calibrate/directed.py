@@ -62,7 +62,7 @@ def with_directions(
             found.law, path.rotation, path.translation, log.anchors, fit.tags
         ).bias
         fit = fit_log(log, settings, model, fit.rotation, shift, beta=beta)
-    return fit, found  # pyright: ignore[reportPossiblyUnbound]
+    return fit, found  # pyrefly: ignore[unbound-name]
 
 
 def _lasting(fit: LinkFit, times: FloatArray) -> float:

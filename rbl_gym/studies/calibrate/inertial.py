@@ -66,7 +66,7 @@ def calibrate_inertial(log: InertialLog, truth: Truth) -> CalibratedInertial:
         clock = time_offset(middle, next(lengths), log.times, next(lengths))
         turn = _turn(log.times - clock.offset_s, gyro, middle, body)
         bias = turn.bias
-    return CalibratedInertial(turn, clock)  # pyright: ignore[reportPossiblyUnbound]
+    return CalibratedInertial(turn, clock)  # pyrefly: ignore[unbound-name]
 
 
 def _turn(stamps: FloatArray, gyro: FloatArray, middle: FloatArray, body: FloatArray) -> SensorTurn:

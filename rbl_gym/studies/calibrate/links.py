@@ -224,7 +224,8 @@ def _with_clock(
         "shift_std_m": fits[1].shift_m - fits[0].shift_m,
         "tags_std_m": np.where(fit.tags_std_m > 0, fits[1].tags - fits[0].tags, 0.0),
     }
-    return fit._replace(**{name: np.hypot(getattr(fit, name), by) for name, by in moved.items()})
+    wider: dict[str, Any] = {k: np.hypot(getattr(fit, k), by) for k, by in moved.items()}
+    return fit._replace(**wider)
 
 
 def _result(

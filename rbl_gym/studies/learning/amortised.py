@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch  # pyright: ignore[reportMissingImports]
+import torch
 
 from rbl_gym.bounds.information import add_range_information
 from rbl_gym.checks import FloatArray
@@ -65,7 +65,7 @@ _FORGET = 0.005
 
 def tensors(tokens: Tokens) -> Any:
     """Return tokens as tensors."""
-    return Tokens(*(torch.as_tensor(x, dtype=torch.float32) for x in tokens))  # pyright: ignore[reportArgumentType]
+    return Tokens(*(torch.as_tensor(x, dtype=torch.float32) for x in tokens))
 
 
 def case_of(batch: Batch) -> Case:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch  # pyright: ignore[reportMissingImports]
+import torch
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.learning.rl_tasks import SEED_STRIDE, RlTask
@@ -132,6 +132,7 @@ def _rolled_out(
 ) -> tuple[_Rollout, np.ndarray]:
     """Run some steps of the worlds; return them and the values of the final states."""
     std, rows = np.exp(learner.log_std.detach().numpy()), []
+    value = np.zeros(0, np.float32)
     for k in range(steps + 1):
         seen = craft_seen(env)
         told = [one.astype(np.float32) for one in (seen.own, seen.pairs, seen.others)]

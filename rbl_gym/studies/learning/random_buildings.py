@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -200,7 +200,7 @@ def _spots(
 ) -> tuple[FloatArray, FloatArray]:
     """Return candidates and their normals on outer walls, the ceiling and inner walls."""
     low, high = rng.uniform(0.5, 0.85) * size[2], rng.uniform(0.86, 0.98) * size[2]
-    faces = []  # origin, u, v, normal
+    faces: list[tuple[Any, Any, Any, Any]] = []  # origin, u, v, normal
     x, y = size[:2]
     up = np.array([0, 0, high - low])
     if rng.random() < 0.85:

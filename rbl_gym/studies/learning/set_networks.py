@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import torch  # pyright: ignore[reportMissingImports]
+import torch
 
 from rbl_gym.studies.learning.deep_sets import SUM_SCALE, DeepSets
 

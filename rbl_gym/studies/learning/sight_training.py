@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import torch  # pyright: ignore[reportMissingImports]
+import torch
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.learning.deep_sets import DeepSets
@@ -93,7 +93,10 @@ def train_sight(
                 optimizer.step()
                 losses.append(float(loss.detach()))
         curve.append(
-            {"steps": (done + 1) * _TRACKS * family.steps, "mean_log_likelihood": -np.mean(losses)}
+            {
+                "steps": (done + 1) * _TRACKS * family.steps,
+                "mean_log_likelihood": -float(np.mean(losses)),
+            }
         )
         advance(_TRACKS * family.steps)
     return network, curve

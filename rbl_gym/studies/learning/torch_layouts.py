@@ -9,9 +9,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch  # pyright: ignore[reportMissingImports]
-from torch import nn  # pyright: ignore[reportMissingImports]
-from torch.nn import functional  # pyright: ignore[reportMissingImports]
+import torch
+from torch import nn
+from torch.nn import functional
 
 from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement import attention
@@ -140,7 +140,7 @@ def legal(kind: str, case: Case, points: torch.Tensor) -> torch.Tensor:
     """Return legal points (B, M, 3) of the region for points (B, M, 3), as `amortised.legal`."""
     low, high = case.low[:, None], case.high[:, None]
     if kind == "box":
-        return _Clip.apply(points, low, high)  # pyright: ignore[reportReturnType]
+        return _Clip.apply(points, low, high)
     if kind == "shell":
         away = points - case.middle[:, None]
         radius = away.norm(dim=-1, keepdim=True).clamp(min=1e-6)
@@ -152,7 +152,7 @@ def legal(kind: str, case: Case, points: torch.Tensor) -> torch.Tensor:
     ray = action / reach[..., None]
     bottom = -torch.ones_like(ray)
     bottom[..., :2] = -2
-    ray = _Clip.apply(ray, bottom, -bottom)  # pyright: ignore[reportAssignmentType]
+    ray = _Clip.apply(ray, bottom, -bottom)
     return middle + ray * half
 
 

@@ -66,7 +66,7 @@ def train(
         As `check_training`.
     """
     algorithm = check_training(task, seed, algorithm)
-    import torch  # pyright: ignore[reportMissingImports]
+    import torch
 
     # One thread: small networks gain nothing from more, and the sums would vary.
     threads = torch.get_num_threads()
@@ -163,7 +163,7 @@ def _taught(
 def _explored(
     algorithm: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]
 ) -> tuple[Callable[[dict[str, Any]], Policy], dict[str, Any]]:
-    import torch  # pyright: ignore[reportMissingImports]
+    import torch
 
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
@@ -192,16 +192,16 @@ def _model(algorithm: str, settings: Training, envs: Any, seed: int) -> Any:
         network["log_std_init"] = settings.log_std_init
     policy = "MlpPolicy"
     if algorithm == "maskable-ppo":
-        from sb3_contrib import MaskablePPO  # pyright: ignore[reportMissingImports]
+        from sb3_contrib import MaskablePPO
 
         form = MaskablePPO
     elif algorithm == "recurrent-ppo":
-        from sb3_contrib import RecurrentPPO  # pyright: ignore[reportMissingImports]
+        from sb3_contrib import RecurrentPPO
 
         form, policy = RecurrentPPO, "MlpLstmPolicy"
         network |= {"lstm_hidden_size": _MEMORY, "net_arch": [_BEHIND]}
     else:
-        from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+        from stable_baselines3 import PPO
 
         form = PPO
     with warnings.catch_warnings():
@@ -258,7 +258,7 @@ class _Curve:
         self._returns: list[float] = []
 
     def callback(self) -> Any:
-        from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
+        from stable_baselines3.common.callbacks import BaseCallback
 
         curve = self
 

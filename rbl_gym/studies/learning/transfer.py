@@ -155,8 +155,8 @@ def _reflecting(scene: Any) -> Any:
     law = {"nlos_probability": NLOS_PROBABILITY, "nlos_bias_m": NLOS_BIAS_M}
     if isinstance(scene, Scene):
         return dataclasses.replace(scene, links=dataclasses.replace(scene.links, **law))
-    scene = {"name": scene} if isinstance(scene, str) else dict(scene)
-    return {**scene, "links": {**scene.get("links", {}), **law}}
+    table: dict[str, Any] = {"name": scene} if isinstance(scene, str) else dict(scene)
+    return {**table, "links": {**table.get("links", {}), **law}}
 
 
 def _episode_logs(task: RlTask, act: Any, worlds: int, seed: int) -> tuple[FloatArray, FloatArray]:

@@ -7,8 +7,6 @@ its ten points only in a drawing; `PLACES` are ours. In addition to the figures 
 convergence of (14) is measured on networks of ten nodes, uniform in a square.
 """
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 import itertools

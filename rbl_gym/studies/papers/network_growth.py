@@ -1,7 +1,5 @@
 """Measure the outlook of the network paper: kappa against n (Section IV-E), and nodes in space."""
 
-# scipy.sparse has no stubs, and pyright infers wrong types for it.
-# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 import itertools
@@ -48,7 +46,7 @@ def kappa_growth(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _grown(sizes: list[tuple[int, sp.csr_matrix]]) -> dict[str, Any]:
-    rows = []
+    rows: list[dict[str, Any]] = []
     for n_nodes, C in sizes:
         kappa = {rule: consensus.step_size(C, rule) for rule in consensus.STEP_RULES}
         factor = {rule: consensus.convergence_factor(C, one) for rule, one in kappa.items()}

@@ -104,7 +104,7 @@ def surveyed_accuracy(
     epoch = bounds.RangeEpoch(anchors, problem.tags, rotation, places[:, None], problem.noise)
     if common is None:
         std = np.full((len(anchors), 3), anchor_std_m) if anchor_std_m > 0 else None
-        told = bounds.information_at(*epoch[:5], share, anchor_std=std)  # pyright: ignore[reportArgumentType]
+        told = bounds.information_at(*epoch[:5], share, anchor_std=std)  # pyrefly: ignore[bad-argument-type]
     else:
         unknown = bounds.Nuisances(None, anchor_std_m, common, "common")
         joint = information_of(epoch, unknown, share)

@@ -99,7 +99,7 @@ def _along_wall(
     left = np.array([normal[1], -normal[0]])
     sides = [("left", left), ("right", -left)]
     ends = [_end(place, along, edges) for _, along in sides]
-    found = []
+    found: list[tuple[str, str, FloatArray]] = []
     for (side, along), end in zip(sides, ends, strict=True):
         # An anchor in the corner touches the next wall: only edges that the tape would enter.
         across = edges[:, 1] - edges[:, 0]

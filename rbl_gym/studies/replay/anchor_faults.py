@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rbl_gym.checks import FloatArray
@@ -76,7 +78,7 @@ def _relative_biases(recording: Recording, track: Track) -> FloatArray | None:
     """Return the mean biases (M,) relative to the median anchor; zero if they are not known."""
     if track.biases is None:
         return None
-    measured = recording.links.any(axis=0)
+    measured: Any = recording.links.any(axis=0)
     there = measured.any(axis=1)
     if there.sum() < 3:
         return None

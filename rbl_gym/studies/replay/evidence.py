@@ -74,7 +74,7 @@ def evidence(trials: Sequence[Trial]) -> Evidence:
             chosen = members[first : first + _TOGETHER]
             for k, result in zip(chosen, _tried([trials[k] for k in chosen]), strict=True):
                 found[k] = result
-    return Evidence(*map(np.array, zip(*found, strict=True)))  # pyright: ignore[reportArgumentType]
+    return Evidence(*map(np.array, zip(*found, strict=True)))
 
 
 def _same_filter(recording: Recording, settings: Settings) -> tuple[Settings, bytes]:
@@ -105,7 +105,7 @@ def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
     tags = np.stack([trial.recording.tags for trial in trials])
     level = level_of(trials[0].settings, np.zeros(3))
     told = _readings(trials)
-    steps = track_epochs(filter, prior, told, level=level)  # pyright: ignore[reportArgumentType]
+    steps = track_epochs(filter, prior, told, level=level)  # pyrefly: ignore[bad-argument-type]
     columns: list[tuple[FloatArray, ...]] = []
     for group, i in innovations_of(filter, steps, tags, RangeNoise()):
         rotation, translation, *_ = group.belief
@@ -120,7 +120,7 @@ def _stacked(filters: list[Any]) -> estimators.Filter:
     if len(filters) == 1 or not isinstance(first, IteratedEkf):
         return first
     std = np.stack([filter.process.std() for filter in filters])
-    process = motion.ProcessNoise(std[:, :3], std[:, 3:])  # pyright: ignore[reportArgumentType]
+    process = motion.ProcessNoise(std[:, :3], std[:, 3:])  # pyrefly: ignore[bad-argument-type]
     tags = np.stack([filter.tags for filter in filters])
     return dataclasses.replace(first, process=process, tags=tags)
 

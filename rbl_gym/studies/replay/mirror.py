@@ -78,7 +78,8 @@ def other_pose(
     plane = mirror.plane_of(anchors)
     if plane.width < 1e-6 or plane.thickness > _THICK * plane.width:
         return None
-    size = max(np.ptp(anchors, axis=0).max(), np.median(recording.ranges[recording.links]))
+    median = float(np.median(recording.ranges[recording.links]))
+    size = max(float(np.ptp(anchors, axis=0).max()), median)
     start = _first_known(track[2], plane.normal, _KNOWN * size)
     if start is None:
         return None
@@ -123,7 +124,7 @@ def _followed(
         elapsed = recording.times[k] - recording.times[k - 1] if k > start else 0.0
         P = np.linalg.inv(np.linalg.inv(state.covariance + elapsed * spread) + hold)
         before = state._replace(covariance=0.5 * (P + P.swapaxes(1, 2)))
-        std = recording.range_std[k] if range_std is None else range_std  # pyright: ignore
+        std = recording.range_std[k] if range_std is None else range_std  # pyrefly: ignore[unsupported-operation]
         state, likelihood, spent = _update(filter, before, recording, k, std)
         gain += likelihood
         cost += spent

@@ -350,7 +350,7 @@ class Settings:
             if dataclasses.is_dataclass(group):
                 new = {key: fields[key] for key in vars(group) if key in fields}
                 if new:
-                    groups[name] = dataclasses.replace(group, **new)  # pyright: ignore[reportArgumentType]
+                    groups[name] = dataclasses.replace(group, **new)
             else:
                 groups[name] = fields.get(name, group)
         return Settings(**groups)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -185,7 +185,7 @@ def _log(recording: Recording, settings: Settings) -> Reading:
         recording.links,
         None if own is None else ranging.LinkNoise(own),
         np.zeros((len(recording.times), 6)),
-        np.diff(recording.times, prepend=recording.times[0]),  # pyright: ignore[reportArgumentType]
+        np.diff(recording.times, prepend=recording.times[0]),  # pyrefly: ignore[bad-argument-type]
     )
 
 
@@ -210,11 +210,11 @@ def readings_of(recording: Recording, settings: Settings) -> list[tuple[FloatArr
 
 def sensed(
     recording: Recording, settings: Settings, start_s: float, end_s: float
-) -> dict[str, FloatArray]:
+) -> dict[str, Any]:
     """Return fields of a `Reading`: the sensor readings between two times."""
     if settings.filter == "iekf-imu" and recording.inertial is not None:
         log = clocked(recording, settings)
-        readings, steps = samples_between(log, start_s, end_s)  # pyright: ignore[reportArgumentType]
+        readings, steps = samples_between(log, start_s, end_s)  # pyrefly: ignore[bad-argument-type]
         return {"inertial": readings, "steps": steps}
     if recording.odometry is None:
         return {}
@@ -277,7 +277,10 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
 
 
 def named_filter(
-    recording: Recording, settings: Settings, name: str, options: dict[str, Any]
+    recording: Recording,
+    settings: Settings,
+    name: str | Callable[..., Any],
+    options: dict[str, Any],
 ) -> estimators.Filter:
     """Return a named filter with the tags of a recording, a random walk and the range noise.
 
