@@ -33,7 +33,7 @@ class Solved(NamedTuple):
 
 
 def solve_network(path: str, weights: str = "information") -> Solved:
-    """Read a file, solve for the orientations, and certify the solution.
+    """Read a file, solve for the orientations, and test whether the chordal minimum is global.
 
     Parameters
     ----------
