@@ -13,9 +13,9 @@ def add_network(commands: Any) -> None:
     network = commands.add_parser(
         "network",
         help="estimate the orientations of a planar network or pose graph",
-        description="Compute maximum-likelihood orientations from edge angles, and their cost. Also "
-        "minimize the chordal cost, the sum of 2 w (1 - cos residual) with the weights w, and test "
-        "whether its minimum is global. See docs/networks.md for the file formats.",
+        description="Compute maximum-likelihood orientations from edge angles, and their cost. "
+        "Also minimize the chordal cost, the sum of 2 w (1 - cos residual) with the weights w, and "
+        "test whether its minimum is global. See docs/networks.md for the file formats.",
     )
     network.add_argument(
         "file", metavar="FILE", help="a .g2o file, or CSV with columns i,j and dtheta (or a,b)"
