@@ -277,10 +277,7 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
 
 
 def named_filter(
-    recording: Recording,
-    settings: Settings,
-    name: str | Callable[..., Any],
-    options: dict[str, Any],
+    recording: Recording, settings: Settings, name: str | Callable, options: dict[str, Any]
 ) -> estimators.Filter:
     """Return a named filter with the tags of a recording, a random walk and the range noise.
 
