@@ -308,7 +308,9 @@ def test_a_wrong_position_of_an_anchor_and_a_wrong_link_are_named(seed):
     assert row["offset_m"] == pytest.approx(0.4, abs=0.15)
     assert figures["misplaced_anchors"] == []
     (note,) = figures["notes"]
-    assert note.startswith("WARNING: the errors of some links differ by more than 0.3 m")
+    assert note.startswith(
+        "WARNING: the errors of some links differ from the median of all links by more than 0.3 m"
+    )
     angle = rng.uniform(0, 2 * np.pi)
     move = 0.5 * np.array([np.cos(angle), np.sin(angle), 0.0])
     anchors = ANCHORS.copy()

@@ -191,7 +191,7 @@ def test_a_table_of_harmonics_is_read_as_it_is_written(tmp_path):
         ("anchor,A,1", "wall,A,1", "must be anchor or tag"),
         ("anchor,A,1", "anchor,Q,1", "must be the id"),
         ("anchor,A,1", "anchor,A,0.5", "must be 1, 2"),
-        ("anchor,A,1", "anchor,A,2", "must be given once"),
+        ("anchor,A,1", "anchor,A,2", "must differ in rows with the same end"),
     ):
         path.write_text(text.replace(old, new))
         with pytest.raises(ValueError, match=message):

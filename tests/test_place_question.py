@@ -382,7 +382,7 @@ def test_what_cannot_be_met_is_said():
         factor = judging.would_pass(judged)["factor"]
         assert (
             f"zone {judged.zone.name!r} would pass only with limits {factor:.3g} times as large "
-            "(position_m = 0.001 decides)"
+            "(hardest to meet: position_m = 0.001)"
         ) in str(error.value)
     with pytest.raises(ValueError, match="fewest needs a requirement"):
         choosing.fewest_anchors(scene_files.problem("uwb_room"), range(3, 9), 0)

@@ -42,7 +42,8 @@ def causal_track(
     times = check_array("times", log.times, ("K",))
     if times.ndim != 1:
         raise ValueError(
-            f"times must have shape (K,) to start from a filter, got shape {times.shape}"
+            "log.times must have shape (K,), as the filter steps all trials at the same times, got "
+            f"shape {times.shape}"
         )
     ranges, anchors = np.asarray(log.ranges, float), np.asarray(log.anchors, float)
     twists = np.zeros((len(times) - 1, 6)) if twists is None else np.asarray(twists, float)

@@ -158,10 +158,11 @@ def _add_anchors(group: Any) -> None:
     )
     for name, text in (
         ("--bias-m", "bias common to all ranges, metres, default 0"),
-        ("--bias-std-m", "standard deviation of this common bias, metres, default 0.5"),
+        ("--bias-std-m", "standard deviation of the common bias, metres, default 0.5"),
         (
             "--link-std-m",
-            "standard deviation of the other biases, one for each link, metres, default 0.05",
+            "standard deviation of the bias of each link, beside the common bias, metres, default "
+            "0.05",
         ),
     ):
         group.add_argument(name, type=float, metavar="X", help=text)

@@ -40,7 +40,9 @@ def add_place(commands: Any) -> None:
     scene = place.add_mutually_exclusive_group(required=True)
     text = "a named scene, a building file .toml or .json, or a plan .dxf, .geojson, .png, .jpg"
     scene.add_argument("scene", nargs="?", metavar="NAME|F", help=text)
-    scene.add_argument("--scene", dest="scene_", metavar="NAME|F", help="the same, as an option")
+    scene.add_argument(
+        "--scene", dest="scene_", metavar="NAME|F", help="the scene, in place of NAME|F"
+    )
     place.add_argument(
         "--anchors",
         type=_numbers,

@@ -123,8 +123,8 @@ def usual_notes(result: dict[str, Any]) -> list[str]:
         return []
     where = " and ".join(f"layouts.{name}.anchors_m" for name in dict.fromkeys(names))
     return [
-        f"{' '.join(found)} The search makes what all zones together lack of their requirements "
-        f"small first, and b only after that. The positions are in the file of --json, {where}: "
+        f"{' '.join(found)} The search reduces the shortfall of all zones together first, and "
+        f"the mean error b only after that. The positions are in the file of --json, {where}: "
         "to use them, write them to a CSV file with the columns x_m,y_m,z_m for --layout."
     ]
 

@@ -113,9 +113,9 @@ def notes(result: dict[str, Any]) -> list[str]:
             )
     if result["obstacles"]:
         found.append(
-            "'not told': the filter does not know which links are blocked. The others know, "
-            "as some radios report it, and weigh these links less. The prediction does so too: "
-            "a 'no' of 'not told' does not contradict it."
+            "The filter 'not told' does not know which links are blocked. The other estimators "
+            "and the prediction know it, as some radios report it, and weigh these links less. "
+            "A 'no' under 'agrees' for 'not told' does not contradict the prediction."
         )
     return found
 

@@ -138,7 +138,8 @@ def _add_tuning(group: Any) -> None:
         "also chooses the filter; with --calibration it takes iekf-bias. The truth is not used",
     )
     _add_numbers(group, (
-        ("tune-s", "length of this first part, seconds, default 20; implies --tune"),
+        ("tune-s", "length of the first part of the log that --tune uses, seconds, default 20; "
+         "implies --tune"),
     ))  # fmt: skip
 
 

@@ -103,7 +103,9 @@ _LOSS = {
         "text", "one of [materials] or a standard material; opaque without material and information"
     ),
     "information": Key(
-        "number", "share of the information that remains, in place of material", **_SHARE
+        "number",
+        "share of a link's information that remains behind it; give this or material, not both",
+        **_SHARE,
     ),
 }
 _REACH = {
@@ -233,7 +235,8 @@ FORMAT: dict[str, Table] = {
                     "closed": _CLOSED,
                     "side": Key(
                         "choice",
-                        "side of the line; the left of a closed line is its inside",
+                        "side of the line where anchors are mounted; the left of a closed line is "
+                        "its inside",
                         default="left",
                         choices=("left", "right", "both"),
                     ),

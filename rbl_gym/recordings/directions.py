@@ -46,13 +46,13 @@ def read_directions(
     table.check((end == "anchor") | (end == "tag"), "end", "must be anchor or tag")
     at_tag = end == "tag"
     at = np.where(at_tag, table.positions("id", ids[1]), table.positions("id", ids[0]))
-    table.check(at >= 0, "id", "must be the id of one of them")
+    table.check(at >= 0, "id", "must be the id of an anchor or a tag, as end says")
     number = table.numbers("harmonic")
     whole = (number == np.round(number)) & (number >= 1) & (number <= _MOST)
     table.check(whole, "harmonic", f"must be 1, 2, ... {_MOST}")
     harmonic = number.astype(int)
     row = (2 * at + at_tag) * (_MOST + 1) + harmonic
-    table.check(is_first(row), "harmonic", "must be given once for each end and id")
+    table.check(is_first(row), "harmonic", "must differ in rows with the same end and id")
     most = int(harmonic.max())
     fields = []
     for cos, sin in (_COLUMNS[3:5], _COLUMNS[5:7]):

@@ -79,8 +79,9 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
         kinds, value = {"box": Box}, {"kind": "box", **value}
     if not kinds and not dataclasses.is_dataclass(old):
         raise ValueError(
-            f"{path} must be one value, got the dict {dict(value)!r:.80}. Values to draw from need "
-            f"scenes=, and one of the keys {', '.join(_LAWS)}"
+            f"{path} must be one value, got the dict {dict(value)!r:.80}. To draw the value at "
+            "random, use scenes= in place of scene=, and a dict with one of the keys "
+            f"{', '.join(_LAWS)}"
             f"{''.join(did_you_mean(key, _LAWS) for key in [*value][:1])}"
         )
     if "kind" not in value:

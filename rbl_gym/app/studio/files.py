@@ -168,8 +168,9 @@ def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
     anchors = state.anchors.tolist()
     head = [
         HEAD,
-        f"{len(anchors)} anchors, b = {state.score:.4g} m. All are listed as fixed: "
-        "`rbl-gym place --scene` judges this layout, `rbl-gym studio` continues from it.",
+        f"{len(anchors)} anchors, predicted RMS error of the tags b = {state.score:.4g} m. All "
+        "anchors are listed as fixed: `rbl-gym place --scene` judges this layout, `rbl-gym studio` "
+        "continues from it.",
     ]
     named = {"name": state.problem.name, **tables}
     changed = {key: value for key, value in named.items() if key != "$schema"}

@@ -40,8 +40,9 @@ def outliers(
     if far:
         named = [f"{row['anchor']}-{row['tag']} by {row['offset_m']:+.2f} m" for row in far]
         notes.append(
-            f"WARNING: the errors of some links differ by more than {MOST_OFF_M:g} m from those of "
-            f"the others: {few(named)}."
+            "WARNING: the errors of some links differ from the median of all links by more than "
+            f"{MOST_OFF_M:g} m: {few(named)}. Check the ids and positions of these anchors and "
+            "tags, and whether the links are blocked."
         )
     for row in wrong:
         move = ", ".join(f"{x:+.2f}" for x in row["move_m"])

@@ -273,7 +273,8 @@ def _check_reachable(problem: Problem, points: FloatArray, seed: int) -> None:
     """Raise ValueError if a zone fails even with an anchor at every candidate (K, 3)."""
     found = [
         f"zone {row['name']!r} would pass only with limits {row['would_pass']['factor']:.3g} times "
-        f"as large ({row['decides']['requirement']} = {row['decides']['limit']:g} decides)"
+        f"as large (hardest to meet: {row['decides']['requirement']} = "
+        f"{row['decides']['limit']:g})"
         for row in map(short_row, judge(problem, points, seed, most=PLACES))
         if row["verdict"] == "fail"
     ]

@@ -62,7 +62,7 @@ def anchor_note(recording: Recording, settings: Settings, track: Track) -> list[
         words = ", ".join(f"{x:+.2f}" for x in move.move_m)
         return [
             f"{name} looks misplaced: its ranges fit those of the other anchors if it is moved by "
-            f"({words}) m. The filter takes the error as biases of its ranges."
+            f"({words}) m. Check its position: the filter's biases hide the error."
         ]
     if abs(offset[m]) > MOST_OFF_M:
         side = "long" if offset[m] > 0 else "short"
