@@ -12,9 +12,12 @@ import pytest
 from rbl_gym import metrics, motion
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import rotations
+from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
+from rbl_gym.studies.replay.mirror import other_pose
+from rbl_gym.studies.replay.tracking import named_filter
 from tests import recorded
 from tests.helpers import needs
 
@@ -113,6 +116,23 @@ def test_ranges_decide_by_what_they_leave_not_by_the_deviation_told():
     lifted = CEILING + np.array([0, 0.3, 0, -0.3, 0, 0.2])[:, None] * [0, 0, 1]
     _, result = outcome(record(lifted, FLAT, noise_m=0.01, epochs=40), range_std_m=0.1)
     assert "mirror" not in result
+
+
+def test_a_track_that_left_a_wrong_start_is_not_doubted_again():
+    """The first pose is excluded, so nothing remains to be covered, wherever the track goes."""
+    anchors = CEILING + np.array([0, 0.3, 0, 0.3, 0.1, 0])[:, None] * [0, 0, 1]
+    log = record(anchors, SOLID, epochs=60)
+    truth: Any = log.truth
+    P = np.tile(np.diag([0.05**2] * 6), (60, 1, 1))
+    Q, t, _ = mirror_pose(truth.rotation, truth.translation, P, anchors, SOLID)
+    right, wrong = (truth.rotation, truth.translation), (Q, t)
+    judge = named_filter(log, replay.Settings.of(**OPTIONS), "iekf", {})
+    at = [*[1] * 5, *[0] * 35, *[1] * 20]
+    track = [np.array([(right, wrong)[a][i][k] for k, a in enumerate(at)]) for i in (0, 1)]
+    found = other_pose(log, judge, 0.03, (track[0], track[1], P))
+    assert found is not None
+    assert found.alive[:5].any()
+    assert not found.alive[5:].any()
 
 
 def test_one_range_at_a_time():

@@ -40,6 +40,8 @@ __all__ = ["track_figures"]
 _NEARER = 0.25
 # Epochs further apart than this (s), and than this multiple of the median, leave a gap.
 _GAP_S, _GAP_STEPS = 1.0, 5.0
+# A mirror pose that was possible for less than this (s) is not reported.
+_WHILE_S = 1.0
 # A smoothed track with a NIS or a NEES per degree of freedom below these has a large covariance.
 _WIDE_NIS, _WIDE_NEES = 0.5, 0.4
 # Number of epochs that is sufficient to find a fault of the truth.
@@ -214,6 +216,8 @@ def _notes(
         }
         told = settings.knowledge.volume is not None or settings.knowledge.below_anchors
         notes.append(_mirror_note(result["mirror"], count, track, told))
+    elif track.other is not None:
+        notes += _past_mirror_note(track)
     known, unknown = known_figures(recording, track)
     result |= known
     # If there is a mirror pose, its own note is sufficient, except for an open turn.
@@ -291,6 +295,23 @@ def _mirror_note(found: dict[str, Any], count: int, track: Track, told: bool) ->
         f"explains the ranges {as_well} in {found['epochs']} of {count} epochs. The belief covers "
         f"both. {given}State where the body is: {either}."
     )
+
+
+def _past_mirror_note(track: Track) -> list[str]:
+    """Return a note if a mirror pose, excluded by now, was possible for a while."""
+    assert track.other is not None
+    alive = track.other.alive
+    times = track.times - track.times[0]
+    if np.diff(times, prepend=0.0)[alive].sum() < _WHILE_S:
+        return []
+    spread = np.sqrt(np.einsum("kii->ki", track.covariance[alive]))
+    turn, place = np.rad2deg(spread[:, :3]).max(), spread[:, 3:].max()
+    first, last = times[alive][[0, -1]]
+    return [
+        f"Note: from {first:.1f} to {last:.1f} s after the start, in {alive.sum()} epochs, a mirror "
+        f"pose explained the ranges as well. There the covariance covers both: its standard "
+        f"deviations are up to {turn:.0f} deg and {place:.2f} m."
+    ]
 
 
 def _fault_hints(

@@ -140,6 +140,9 @@ def _followed(
         # The track is at the nearer of the two poses.
         off = np.linalg.norm(state.translation - track[1][k], axis=-1)
         far = int(off[1] >= off[0])
+        if far == 0 and odds > -_DEAD:
+            # The track is at the image, and the first pose is excluded for good.
+            break
         if volume is not None and is_outside(volume, state.translation[far], state.covariance[far]):
             continue
         for field, value in zip(result[:3], state, strict=True):
