@@ -133,6 +133,12 @@ def test_a_track_that_left_a_wrong_start_is_not_doubted_again():
     assert found is not None
     assert found.alive[:5].any()
     assert not found.alive[5:].any()
+    past = found._replace(alive=np.arange(60) < 20, log_odds=np.full(60, -np.inf))
+    doubted = replay.Track(log.times, *right, P, past)
+    notes = replay.track_figures(log, doubted, None, replay.Settings.of(**OPTIONS))["notes"]
+    (note,) = [note for note in notes if "mirror" in note]
+    assert note.startswith("Note: from 0.0 to 1.9 s after the start, in 20 epochs, a mirror pose")
+    assert "up to 3 deg and 0.05 m" in note
 
 
 def test_one_range_at_a_time():

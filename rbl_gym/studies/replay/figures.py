@@ -308,8 +308,8 @@ def _past_mirror_note(track: Track) -> list[str]:
     turn, place = np.rad2deg(spread[:, :3]).max(), spread[:, 3:].max()
     first, last = times[alive][[0, -1]]
     return [
-        f"Note: from {first:.1f} to {last:.1f} s after the start, in {alive.sum()} epochs, a mirror "
-        f"pose explained the ranges as well. There the covariance covers both: its standard "
+        f"Note: from {first:.1f} to {last:.1f} s after the start, in {alive.sum()} epochs, a "
+        "mirror pose explained the ranges as well. There the covariance covers both: its standard "
         f"deviations are up to {turn:.0f} deg and {place:.2f} m."
     ]
 
