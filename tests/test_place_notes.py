@@ -20,8 +20,9 @@ from rbl_gym.app.place_notes import (
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import accuracy, check
 from rbl_gym.studies.placing.answer import Question, place_anchors
-from rbl_gym.studies.placing.given import given_notes
+from rbl_gym.studies.placing.given import given_notes, mount_names
 from rbl_gym.studies.placing.judging import at_edges, judge, judge_beside, short_row, zone_row
+from rbl_gym.studies.placing.layout_export import mounting_list
 from rbl_gym.studies.placing.lever import lever_row
 
 HALL = {
@@ -264,16 +265,34 @@ def test_given_anchors_in_a_wall_or_just_off_a_mount_are_named():
     problem = scene_files.of_mapping(HALL | walls)
     anchors = [[0.1, 2, 2], [0.15, 4, 2], [0.05, 5, 2], [9.5, 0.2, 1], [6, 4, 3], [6, 4, 1]]
     names = ["on", "off", "in", "box", "up", "free"]
-    box, wall, off = given_notes(problem, np.array(anchors, float), names)
+    box, wall, off, free = given_notes(problem, np.array(anchors, float), names)
     assert wall.startswith("Anchor 'in' is inside a wall or an obstacle: x -0.10 to 0.10 m, y 0.00")
     assert box.startswith("Anchor 'box' is inside a wall or an obstacle: x 9.00 to 10.00 m")
     assert "'off' 0.05 m from 'west', where it would be at (0.100, 4.000, 2.000)." in off
     assert off.count("where") == 1
+    assert free.startswith("Anchor 'free' at (6.000, 4.000, 1.000) is on no mount")
     placed = place_anchors(
         problem, Question(range(4, 5), layout=np.array(anchors[:4]), trials=4, survive=0)
     )
     assert sum("inside a wall" in note for note in place_answer.warnings(placed.result)) == 2
     assert place_answer.question(placed.result)[0] == "How good are these 4 anchors in 'file'?"
+
+
+def test_given_anchors_on_no_mount_are_named_and_a_wrong_unit():
+    problem = scene_files.of_mapping(HALL | {"anchors": {"number": 4, "fixed": [[6, 1, 2]]}})
+    anchors = np.array([[0.5, 0.5, 3], [6, 4, 2.4], [15, 4, 3], [6, 1, 2], [1, 1, 3.005]])
+    assert mount_names(problem, anchors) == ["ceiling 1", *["no mount"] * 3, "ceiling 1"]
+    (note,) = given_notes(problem, anchors, list("abcde"))
+    assert note == (
+        "Anchor 'b' at (6.000, 4.000, 2.400) is on no mount: the nearest point of one is 0.60 m "
+        "away (ceiling 1); anchor 'c' at (15.000, 4.000, 3.000) is on no mount: the nearest point "
+        "of one is 3.00 m away (ceiling 1)."
+    )
+    (note,) = given_notes(problem, 1000 * ANCHORS, list("abcd"))
+    assert note.endswith(" Are the positions in mm? The file must have metres.")
+    (note,) = given_notes(problem, ANCHORS + 500, list("abcd"))
+    assert "Check the unit and the origin" in note
+    assert [row["mount"] for row in mounting_list(problem, anchors)][1:3] == ["no mount"] * 2
 
 
 def test_the_first_page_has_all_zones_above_the_footnote(tmp_path):

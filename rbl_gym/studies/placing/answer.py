@@ -19,7 +19,7 @@ from rbl_gym.studies.placing.changes import is_flat, out_of_plane, with_next
 from rbl_gym.studies.placing.choosing import Fewest
 from rbl_gym.studies.placing.contributions import without_each
 from rbl_gym.studies.placing.design import Design
-from rbl_gym.studies.placing.given import given_notes
+from rbl_gym.studies.placing.given import given_notes, mount_names
 from rbl_gym.studies.placing.judging import (
     PLACES,
     Judged,
@@ -277,7 +277,7 @@ def _anchors(
     for k, (place, mount, cost, without) in enumerate(
         zip(
             anchors.tolist(),
-            problem.mounts.names(anchors),
+            mount_names(problem, anchors),
             problem.mounts.cost(anchors).tolist(),
             without_each([one._replace(without=None) for one in judged], lost),
             strict=True,

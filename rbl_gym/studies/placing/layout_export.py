@@ -14,6 +14,7 @@ from rbl_gym.geometry.polygons import rectangle
 from rbl_gym.placement.plans.drawing import UNITS
 from rbl_gym.placement.scene_files import Problem
 from rbl_gym.recordings.writing import write_table
+from rbl_gym.studies.placing.given import mount_names
 from rbl_gym.studies.placing.tape import direction, floor_below, measured_from
 
 __all__ = ["LAYER", "SUFFIXES", "mounting_list", "write_layout"]
@@ -30,7 +31,8 @@ def mounting_list(
 ) -> list[dict[str, Any]]:
     """Return what is needed to mount each anchor, as plain values.
 
-    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name), ``above_floor_m`` (height above z =
+    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name, or
+    ``no mount``), ``above_floor_m`` (height above z =
     0, or above the top of the slab below), ``faces`` (``down``, ``+x``, an angle from +x in
     degrees, or ``any``), and ``measured``: up to two distances from walls (`tape.measured_from`).
 
@@ -43,7 +45,7 @@ def mounting_list(
     """
     anchors = check_array("anchors", anchors, ("M", 3))
     names = [str(k + 1) for k in range(len(anchors))] if names is None else names
-    mounts, normals = problem.mounts.names(anchors), problem.mounts.normal(anchors)
+    mounts, normals = mount_names(problem, anchors), problem.mounts.normal(anchors)
     rows = []
     for name, anchor, mount, normal in zip(names, anchors, mounts, normals, strict=True):
         x, y, z = (round(value, 3) + 0.0 for value in anchor.tolist())
