@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import inspect
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from rbl_gym.estimators import filter as belief
 from rbl_gym.recordings import Files, read_recording
 from rbl_gym.studies import monte_carlo, replay
 from rbl_gym.studies.bench import figures as bench_figures
-from rbl_gym.studies.bench import leaderboard, records, spec_files
+from rbl_gym.studies.bench import leaderboard, records, sources, spec_files
 from rbl_gym.studies.bench import worlds as bench_worlds
 from rbl_gym.worlds import scenes
 from tests import recorded
@@ -475,6 +475,17 @@ def test_rerun_gives_the_same_and_says_what_differs(tmp_path, short, capsys):
     assert "3 of 4 records are identical" in capsys.readouterr().out
 
 
+def test_rerun_compares_records_of_one_name_with_their_own_scene(tmp_path, capsys):
+    path = tmp_path / "room.json"
+    for floor in (0.5, 0.05):
+        path.write_text(json.dumps(SHORT | {"noise": {"floor_m": floor}}))
+        bench(tmp_path, "--scenes", path, "--filters", "kf", "--conditions", "nominal")
+    assert main(["rerun", str(tmp_path / "x.jsonl")]) == 0
+    shown = capsys.readouterr().out
+    assert "2 of 2 records are identical" in shown
+    assert "what differs" not in shown
+
+
 def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
     (tmp_path / "empty.jsonl").write_text("")
     assert main(["rerun", str(tmp_path / "empty.jsonl")]) == 2
@@ -603,9 +614,58 @@ def test_a_filter_is_ours_by_where_its_factory_lives(monkeypatch):
     monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
     assert {leaderboard.source_of(name) for name in belief._FACTORIES} == {"rbl-gym"}
     belief.register("mine", lambda tags, noise, process: None)  # pyrefly: ignore[bad-argument-type]
-    assert leaderboard.source_of("mine") == leaderboard._digest([Path(__file__)])
+    assert len(sources.source_of("mine")) == 16
     with pytest.raises(ValueError, match="filter must be one of"):
-        leaderboard.source_of("nobody")
+        sources.source_of("nobody")
+
+
+@pytest.mark.parametrize(
+    ("files", "home"),
+    [
+        ({"src_a.py": "import src_b", "src_b.py": ""}, "src_a"),
+        ({"src_c.py": "def f():\n    from src_d import X", "src_d.py": "import src_e",
+          "src_e.py": "import src_c"}, "src_c"),
+        ({"src_f/__init__.py": "", "src_f/a/__init__.py": "", "src_f/a/b.py": "from ..c import X",
+          "src_f/c.py": "from . import d, e", "src_f/d.py": "", "src_f/e/__init__.py": ""},
+         "src_f.a.b"),
+        ({"src_g/__init__.py": "from .h import *", "src_g/h.py": ""}, "src_g"),
+    ],
+)  # fmt: skip
+def test_a_filter_is_its_module_and_those_beside_it_that_it_imports(
+    tmp_path, monkeypatch, files, home
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sources, "factory_of", lambda name: type)
+    monkeypatch.setattr(sources, "import_module", lambda name: importlib.util.module_from_spec(
+        importlib.util.find_spec(name)))  # fmt: skip
+    for name, text in {**files, "src_z.py": "import src_a"}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = [sources.source_of(f"{home}:F")]
+    for name in files:
+        (tmp_path / name).write_text(files[name] + "\n")
+        found.append(sources.source_of(f"{home}:F"))
+    assert len(set(found)) == 1 + len(files)
+    (tmp_path / "src_z.py").write_text("")
+    assert sources.source_of(f"{home}:F") == found[-1]
+
+
+def test_results_of_an_edited_helper_are_computed_again(tmp_path, short, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "bench_wrap.py").write_text(
+        "import bench_helper\nfrom rbl_gym import estimators\n"
+        "def F(tags, noise, process):\n"
+        "    return estimators.make('iekf', tags=tags, noise=noise, process=process)\n"
+    )
+    (tmp_path / "bench_helper.py").write_text("")
+    options = ["--scenes", short, "--conditions", "nominal", "--filters", "iekf,bench_wrap:F"]
+    assert bench(tmp_path, *options)[0] == 0
+    assert "results from" not in capsys.readouterr().out
+    for text, taken in (("", 2), ("A = 1\n", 1)):
+        (tmp_path / "bench_helper.py").write_text(text)
+        assert bench(tmp_path, *options)[0] == 0
+        shown = capsys.readouterr().out
+        assert f"{taken} of 2 results from {tmp_path / 'x.jsonl'}; --fresh computes all" in shown
 
 
 def test_filters_made_for_other_worlds_run_when_they_are_named():

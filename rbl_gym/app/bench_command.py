@@ -109,9 +109,15 @@ def _bench(options: argparse.Namespace) -> int:
         options.trials,
         options.seed,
     )
+    steps: list[int] = []
     with progress("bench", sum(len(task.filters) for task in tasks)) as advance:
+
+        def count(finished: int) -> None:
+            steps.append(finished)
+            advance(finished)
+
         records, timings = bench_files.run_tasks(
-            tasks, Path(options.out), workers=workers, fresh=options.fresh, advance=advance
+            tasks, Path(options.out), workers=workers, fresh=options.fresh, advance=count
         )
     result = leaderboard.summary(records, timings)
     if options.html:
@@ -122,6 +128,8 @@ def _bench(options: argparse.Namespace) -> int:
         from rbl_gym.app import bench_report
 
         bench_report.print_bench(result)
+        if steps[0]:
+            print(f"{steps[0]} of {len(records)} results from {options.out}; --fresh computes all")
         print_files(records=options.out, page=options.html)
     failed = any(row["status"] == "failed" for row in result["rows"])
     without = {row["filter"] for row in result["rows"]}

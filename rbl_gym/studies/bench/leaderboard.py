@@ -8,13 +8,8 @@ separately.
 from __future__ import annotations
 
 import functools
-import hashlib
-import inspect
 import json
-import sys
 from collections.abc import Mapping, Sequence
-from importlib import import_module
-from importlib.metadata import entry_points
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,8 +20,8 @@ import scipy
 import rbl_gym
 from rbl_gym import estimators, wrappers
 from rbl_gym.checks import check_one_of
-from rbl_gym.estimators.filter import factory_of
 from rbl_gym.studies.bench import figures, recordings, stages, worlds
+from rbl_gym.studies.bench.sources import digest, source_of
 from rbl_gym.studies.bench.worlds import CONDITIONS
 from rbl_gym.worlds import scenes
 
@@ -182,22 +177,6 @@ def _head(task: Task, filter: str) -> dict[str, Any]:
     }
 
 
-def source_of(name: str) -> str:
-    """Return the source of a filter: a package and its version, or its module digest."""
-    factory = factory_of(name)
-    while isinstance(factory, functools.partial):
-        factory = factory.func
-    home = name.partition(":")[0] if ":" in name else factory.__module__
-    if home.startswith("rbl_gym."):
-        return "rbl-gym"
-    for entry in entry_points(group=estimators.ENTRY_POINT_GROUP):
-        if entry.name == name:
-            return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
-    module = sys.modules.get(home) or import_module(home)
-    file = inspect.getsourcefile(module)
-    return _digest([Path(file)]) if file else name
-
-
 @functools.cache
 def versions() -> dict[str, str]:
     """Return the versions that the figures depend on; `code` is a digest of this package."""
@@ -208,17 +187,10 @@ def versions() -> dict[str, str]:
     files = [file for folder in folders for file in folder.rglob("*.py")]
     return {
         "rbl-gym": rbl_gym.__version__,
-        "code": _digest(files),
+        "code": digest(files),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
     }
-
-
-def _digest(files: list[Path]) -> str:
-    digest = hashlib.sha256()
-    for file in sorted(files, key=lambda file: (file.parent.name, file.name)):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def summary(

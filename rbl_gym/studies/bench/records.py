@@ -54,7 +54,7 @@ def run_tasks(
     fresh
         Overwrite the file instead of resuming it.
     advance
-        Called with the number of finished records.
+        Called with the number of finished records, first with that of the file.
 
     Raises
     ------
@@ -247,35 +247,37 @@ def rerun(
     changed), ``field`` (its name), ``before`` and ``after``. ``versions`` has the two versions by
     name where they differ; ``sources`` has the same for filters and scenes whose own files changed.
     """
-    before: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    before: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
-        before.setdefault(_place(record), []).append(record)
-    rows, versions, sources, identical = [], {}, {}, 0
+        before.setdefault(_setting(record), []).append(record)
+    rows: dict[str, list[dict[str, Any]]] = {setting: [] for setting in before}
+    versions, sources, identical = {}, {}, 0
     for _, results in backends.each(leaderboard.run_task, tasks_of(records), workers):
-        for record, old in ((new, old) for new, _ in results for old in before[_place(new)]):
-            found = compare(old, record)
-            for path in [path for path in found if path.startswith("versions.")]:
-                versions[path.removeprefix("versions.")] = found.pop(path)
-            for path in [path for path in found if path in ("scene_hash", "filter_source")]:
-                name = record["scene" if path == "scene_hash" else "filter"]
-                sources[name] = found.pop(path)
-            identical += not found
-            if found:
-                rows.append(_change(record, found))
+        for record, _ in results:
+            setting = _setting(record)
+            for old in before[setting]:
+                found = compare(old, record)
+                for path in [path for path in found if path.startswith("versions.")]:
+                    versions[path.removeprefix("versions.")] = found.pop(path)
+                for path in [path for path in found if path in ("scene_hash", "filter_source")]:
+                    name = record["scene" if path == "scene_hash" else "filter"]
+                    sources[name] = found.pop(path)
+                identical += not found
+                if found:
+                    rows[setting].append(_change(record, found))
         advance(len(results))
-    order = list(before)
-    rows.sort(key=lambda row: order.index(_place(row)))
     return {
         "records": len(records),
         "identical": identical,
-        "changed": rows,
+        "changed": [row for changed in rows.values() for row in changed],
         "versions": versions,
         "sources": sources,
     }
 
 
-def _place(record: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(record[name] for name in _PLACE)
+def _setting(record: Mapping[str, Any]) -> str:
+    """Return what a record is the result of, apart from versions and sources, as text."""
+    return json.dumps([record[name] for name in ("spec", *_PLACE)], sort_keys=True)
 
 
 def _change(record: Mapping[str, Any], found: dict[str, tuple[Any, Any]]) -> dict[str, Any]:
