@@ -172,6 +172,17 @@ def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArra
     }
 
 
+def check_state(state: Any, batch: tuple[int, ...]) -> None:
+    """Check that a state of a batch is a NamedTuple of arrays with the leading axes of the batch."""
+    require(
+        isinstance(state, tuple)
+        and hasattr(state, "_fields")
+        and all(np.shape(field)[: len(batch)] == batch for field in state),
+        "a state must be a NamedTuple of arrays whose leading axes are those of the prior, got "
+        f"{type(state).__name__}: commands and vector environments take it apart",
+    )
+
+
 def check_shapes(
     name: str, pose: Any, batch: tuple[int, ...], fields: Sequence[str] = (*FIELDS, "matrix")
 ) -> None:
