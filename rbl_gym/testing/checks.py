@@ -134,11 +134,9 @@ def _filter_shapes(make_filter: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
         filter = _made(make_filter)
         with batched(batch):
-            belief = _beliefs(filter, _drawn(filter, rng, batch, 2))[-1]
-            check_shapes("belief", belief, batch)
-            if batch:  # of one body alone any state will do for the message of its beliefs
-                prior = _drawn(filter, rng, batch, 1).prior
-                check_state(call("initial", filter.initial, *prior), batch)
+            check_shapes("belief", _beliefs(filter, _drawn(filter, rng, batch, 2))[-1], batch)
+            if batch:  # a filter of one body gets the message of its beliefs
+                check_state(filter.initial(*_drawn(filter, rng, batch, 1).prior), batch)
 
 
 def _filter_pose(make_filter: Any, rng: np.random.Generator) -> None:
@@ -307,9 +305,8 @@ def _made(make_filter: Callable[..., Any], noise: ranging.NoiseLaw = NOISE) -> A
     return call("make_filter(tags=, noise=, process=)", make_filter, **laws)
 
 
-def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray | None = None) -> list[Any]:
+def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray = ANCHORS) -> list[Any]:
     """Return the belief after every epoch."""
-    anchors = ANCHORS if anchors is None else anchors
     state = call("initial", filter.initial, *epochs.prior)
     beliefs = []
     for k, ranges in enumerate(epochs.ranges):
@@ -325,8 +322,8 @@ def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray | None = None) -> 
 
 def _locator_shapes(locate: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
-        found = _located(locate, draw_epochs(rng, batch, 1).ranges[0])
-        check_shapes("estimate", found, batch, FIELDS)
+        ranges = draw_epochs(rng, batch, 1).ranges[0]
+        check_shapes("estimate", _located(locate, ranges), batch, FIELDS)
 
 
 def _locator_pose(locate: Any, rng: np.random.Generator) -> None:
@@ -384,9 +381,8 @@ def _locator_nees(locate: Any, rng: np.random.Generator) -> None:
 
 
 def _located(
-    locate: Any, ranges: FloatArray, anchors: FloatArray | None = None, links: Any = None
+    locate: Any, ranges: FloatArray, anchors: FloatArray = ANCHORS, links: Any = None
 ) -> Any:
-    anchors = ANCHORS if anchors is None else anchors
     return call("locate", locate, ranges, anchors, TAGS, NOISE, links=links)
 
 

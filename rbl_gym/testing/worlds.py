@@ -173,7 +173,7 @@ def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArra
 
 
 def check_state(state: Any, batch: tuple[int, ...]) -> None:
-    """Check that a state of a batch is a NamedTuple of arrays with the leading axes of the batch."""
+    """Check that a state is a NamedTuple of arrays with the leading axes of its batch."""
     require(
         isinstance(state, tuple)
         and hasattr(state, "_fields")
