@@ -275,6 +275,18 @@ def check_takes_noise(name: str | Callable[..., Filter], filter: Filter, why: st
     )
 
 
+def belief_of(filter: Filter, state: Any) -> PoseBelief:
+    """Return the belief of a filter; raises TypeError if it is no `PoseBelief`."""
+    belief = filter.belief(state)
+    if getattr(belief, "_fields", None) != PoseBelief._fields:
+        raise TypeError(
+            f"belief of the filter {type(filter).__name__} must return rbl_gym.estimators."
+            f"PoseBelief({', '.join(PoseBelief._fields)}), got a {type(belief).__name__}"
+            + (f" of {len(belief)}" if isinstance(belief, tuple | list) else "")
+        )
+    return belief
+
+
 def reads(filter: Filter) -> str:
     """Return the input of a filter's `predict`: ``"twist"``, ``"inertial"`` or ``"odometry"``."""
     return getattr(filter, "reads", "twist")

@@ -15,6 +15,7 @@ from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.estimators.filter import (
     Filter,
     PoseBelief,
+    belief_of,
     check_takes_noise,
     factory_of,
     make,
@@ -149,7 +150,7 @@ class _OneByOne:
     def belief(self, state: _Bodies) -> PoseBelief:
         """Return the beliefs of the bodies, stacked."""
         bodies = state.bodies
-        beliefs = [filter.belief(one) for _, filter, one in _copies(bodies)]
+        beliefs = [belief_of(filter, one) for _, filter, one in _copies(bodies)]
         fields = (np.stack([np.asarray(one[k], np.float64) for one in beliefs]) for k in range(4))
         return PoseBelief(*(field.reshape(*bodies.shape, *field.shape[1:]) for field in fields))
 

@@ -6,7 +6,7 @@ import os
 import signal
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rbl_gym import estimators
 
@@ -53,6 +53,53 @@ def refuses_the_paper(*, tags: Any, noise: Any, process: Any) -> Any:
             return belief._replace(covariance=belief.covariance[..., :3, :3])
 
     return Flat()
+
+
+class Tuples:
+    """Dead reckoning whose belief is a plain tuple."""
+
+    def __init__(self, *, tags: Any, noise: Any, process: Any) -> None:
+        self.inner = estimators.make("iekf", tags=tags, noise=noise, process=process)
+
+    def initial(self, *prior: Any) -> Any:
+        """As the iterated EKF does."""
+        return self.inner.initial(*prior)
+
+    def predict(self, state: Any, twist: Any, dt: float) -> Any:
+        """As the iterated EKF does."""
+        return self.inner.predict(state, twist, dt)
+
+    def update(
+        self, state: Any, ranges: Any, anchors: Any, links: Any = None, noise: Any = None
+    ) -> Any:
+        """Ignores the ranges."""
+        return state
+
+    def belief(self, state: Any) -> Any:
+        """Only three of the four fields."""
+        return tuple(self.inner.belief(state)[:3])
+
+
+class _Pair(NamedTuple):
+    mean: Any
+    spread: Any
+
+
+class OtherState(Tuples):
+    """Dead reckoning whose state has other names."""
+
+    def initial(self, *prior: Any) -> Any:
+        """A state without the field covariance."""
+        return _Pair(prior[:2], prior[2])
+
+    def predict(self, state: Any, twist: Any, dt: float) -> Any:
+        """As the iterated EKF does."""
+        found = self.inner.predict(self.inner.initial(*state.mean, state.spread), twist, dt)
+        return _Pair(found[:2], found[2])
+
+    def belief(self, state: Any) -> Any:
+        """All four fields."""
+        return estimators.PoseBelief(*state.mean, state.spread, state.mean[0])
 
 
 not_callable = 3

@@ -256,6 +256,16 @@ def test_meaning_of_the_flat_observation_checked_by_hand():
 # --- what it refuses --------------------------------------------------------------------------
 
 
+def test_a_belief_that_is_a_plain_tuple_names_the_filter():
+    message = r"belief of the filter Tuples must return .*PoseBelief\(.*, got a tuple of 3"
+    env = EstimatePose(gym.make(ID, reward="none"), "tests.fragile:Tuples")
+    with pytest.raises(TypeError, match=message):
+        env.reset(seed=0)
+    envs = VectorEstimatePose(gym.make_vec(ID, num_envs=2), "tests.fragile:Tuples")
+    with pytest.raises(TypeError, match=message):
+        envs.reset(seed=0)
+
+
 def test_environment_of_another_kind_is_named():
     with pytest.raises(ValueError, match=r"env must be RBL/Tracking-v0 or another.*CartPole"):
         EstimatePose(gym.make("CartPole-v1"))

@@ -313,7 +313,7 @@ def test_filters_and_references_by_task():
     assert transfer.tracking_filters(rl_task("auv_buoys")) == [
         "iekf",
         "iekf-bank",
-        "iekf, reflections",
+        "iekf/robust=true, reflections",
     ]
     everywhere = transfer.tracking_filters(rl_task("auv_buoys"))
     assert transfer.tracking_filters(rl_task("mounts")) == [*everywhere, "uc-kf"]
@@ -380,7 +380,12 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     arguments = ["transfer", "mounts", "--worlds", "1", "--repeats", "1", "--policy", str(path)]
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert list(result["filters"]) == ["iekf", "iekf-bank", "iekf, reflections", "uc-kf"]
+    assert list(result["filters"]) == [
+        "iekf",
+        "iekf-bank",
+        "iekf/robust=true, reflections",
+        "uc-kf",
+    ]
     for rows in result["filters"].values():
         assert list(rows) == ["random", "greedy-swaps", "mine"]
         assert rows["mine"]["correlation"] is None
@@ -433,10 +438,10 @@ def test_transfer_of_a_loop_by_hand():
     found = transfer.transfer_task(
         task, {"mine": policy}, ["orbit"], 4, 1, 5, lambda steps=1, *, more=0: told.append(steps)
     )
-    assert list(found["filters"]) == ["iekf", "iekf-bank", "iekf, reflections"]
+    assert list(found["filters"]) == ["iekf", "iekf-bank", "iekf/robust=true, reflections"]
     assert sum(told) == 6
     law = {"nlos_probability": transfer.NLOS_PROBABILITY, "nlos_bias_m": transfer.NLOS_BIAS_M}
-    for name in ("iekf", "iekf, reflections"):
+    for name in ("iekf", "iekf/robust=true, reflections"):
         kind, options, reflections = transfer.FILTERS[name]
         members = [{**scenes[0], "links": law}] if reflections else scenes
         filter = {"name": kind, **options}

@@ -306,8 +306,15 @@ def test_a_scene_file_is_the_scene_of_its_overrides(tmp_path):
     assert (
         scenes.get({"name": str(path), "links": {"drop_probability": 0.2}}).anchors == made.anchors
     )
+    with pytest.raises(
+        ValueError, match=r"n_anchors must be 5, the number of anchors in .*, got 6"
+    ):
+        scenes.get({"name": str(path), "n_anchors": 6})
+    drawn = scenes.get({"name": str(path), "n_anchors": 6, "anchors": None})
+    assert (drawn.anchors, drawn.n_anchors) == (None, 6)
     toml = tmp_path / "hall.toml"
     toml.write_text('name = "hall"\nsteps = 3\n')
+    assert scenes.get({"name": str(toml), "n_anchors": 6}).anchors is None
     assert scenes.get(str(toml)) == scenes.get({"name": "hall", "steps": 3})
     kinds: dict[str, dict[str, Any]] = {"Tracking": {}, "AnchorSelection": {"k": 2}}
     for name, arguments in kinds.items():

@@ -22,7 +22,7 @@ from rbl_gym.studies.bench import figures as bench_figures
 from rbl_gym.studies.bench import leaderboard, records, sources, spec_files
 from rbl_gym.studies.bench import worlds as bench_worlds
 from rbl_gym.worlds import scenes
-from tests import recorded
+from tests import fragile, recorded
 from tests.helpers import ROOT
 
 SHORT = {"name": "uwb_room", "steps": 4}
@@ -320,6 +320,29 @@ def test_a_filter_that_takes_no_such_law_and_one_without_a_pose_are_rows(tmp_pat
     assert room["status"] == "failed"
     assert "TypeError: beliefs must have arrays" in room["message"]
     assert "got [(6, 3, 3), (6, 3), (6, 3, 3)]" in room["message"]
+
+
+def test_a_belief_that_is_a_plain_tuple_is_a_row_and_names_the_filter(tmp_path, short, capsys):
+    status, data = bench(tmp_path, "--scenes", short, "--conditions", "nominal",
+                         "--filters", "iekf,tests.fragile:Tuples")  # fmt: skip
+    assert status == 1
+    good, bad = rows(data)
+    assert (good["status"], bad["status"]) == ("ok", "failed")
+    assert (
+        "belief of the filter Tuples must return rbl_gym.estimators.PoseBelief(" in (bad["message"])
+    )
+    assert "failed, see below" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("one_by_one", [False, True])
+def test_trials_need_only_the_belief_of_a_filter(one_by_one):
+    trials = monte_carlo.simulate_trials(scenes.get(SHORT), 3, np.random.default_rng(0))
+    make = estimators.one_by_one("tests.fragile:OtherState") if one_by_one else fragile.OtherState
+    trace = monte_carlo.track_trials(trials, make, {})  # pyrefly: ignore[bad-argument-type]
+    iekf = monte_carlo.track_trials(trials, "iekf", {})
+    assert trace.own_translation.shape == iekf.own_translation.shape == (5, 3)
+    assert (np.diff(trace.own_translation, axis=0) > 0).all()  # dead reckoning
+    np.testing.assert_allclose(trace.own_translation[0], 3 * 0.5**2, rtol=0.5)
 
 
 def test_the_table_of_stress_has_the_ratio_to_the_bound(tmp_path, short, capsys, monkeypatch):

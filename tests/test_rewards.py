@@ -102,6 +102,16 @@ def test_a_named_reward_survives_the_spec_as_json():
     assert env.step(0)[1] == again.step(0)[1]
 
 
+def no_bound(outcome: Outcome):
+    """Needs the bound of the environment."""
+    return -np.log(outcome.bound_m)  # pyrefly: ignore[no-matching-overload]
+
+
+def test_a_missing_bound_is_named():
+    with pytest.raises(ValueError, match=r"bound_m of the Outcome is None, because .*='none'"):
+        step_of("uwb_room", no_bound, world="none")
+
+
 @pytest.mark.parametrize(
     ("reward", "named"),
     [

@@ -13,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from rbl_gym import estimators, metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, PoseBelief
-from rbl_gym.estimators.filter import check_takes_noise, factory_of, parse_filter, reads
+from rbl_gym.estimators.filter import belief_of, check_takes_noise, factory_of, parse_filter, reads
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise
 from rbl_gym.worlds.families import SceneFamily
@@ -140,7 +140,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._family is not None:
             observation = unpadded(observation, self._scene)
         self._state = update(self._filter, self._state, observation, self._scene)
-        return self._filter.belief(self._state)
+        return belief_of(self._filter, self._state)
 
     def _judged(
         self, belief: PoseBelief, info: dict[str, Any]

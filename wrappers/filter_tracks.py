@@ -11,6 +11,7 @@ import numpy as np
 from rbl_gym import metrics, motion, placement
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.estimators import Filter, PoseBelief
+from rbl_gym.estimators.filter import belief_of
 from rbl_gym.geometry import rotations
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.worlds import simulation
@@ -199,7 +200,7 @@ def follow(
             epoch = {"ranges": ranges, "links": links, "anchors": anchors}
             epoch |= {} if quality is None else {"quality": quality}
             state = update(filter, state, epoch, scene)
-        yield filter.belief(state)
+        yield belief_of(filter, state)
 
 
 def check_determined(task: PlacementTask, name: object, filter: Filter) -> None:

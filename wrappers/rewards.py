@@ -163,7 +163,15 @@ def _priced(reward: Reward, price: float, outcome: Outcome) -> FloatArray:
 
 def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
     """Return the rewards of a step, a finite number for each world; may raise ValueError."""
-    value: Any = reward(outcome)
+    try:
+        value: Any = reward(outcome)
+    except (TypeError, AttributeError) as error:
+        if outcome.bound_m is not None or "NoneType" not in str(error):
+            raise
+        raise ValueError(
+            f"reward {_label(reward)} raised {error!r:.160}; bound_m of the Outcome is None, "
+            "because the environment has reward='none'"
+        ) from error
     one_world = isinstance(value, float) and isinstance(outcome.figures.score_m, float)
     if one_world and math.isfinite(value):
         return value

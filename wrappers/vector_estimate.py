@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from rbl_gym import metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, PoseBelief
-from rbl_gym.estimators.filter import reads
+from rbl_gym.estimators.filter import belief_of, reads
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import (
     FilterLike,
@@ -268,7 +268,7 @@ def _check_batched(
 
 def _believed(part: _Part, state: Any) -> PoseBelief:
     """Return the belief of the worlds of a part; raises ValueError if it has not one for each."""
-    belief = part.filter.belief(state)
+    belief = belief_of(part.filter, state)
     shape = np.shape(belief[1])
     if shape != (len(part.rows), 3):
         raise ValueError(f"{_one_body(part)}; its belief has a translation of shape {shape}")

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import metrics
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, PoseBelief, hold_level
-from rbl_gym.estimators.filter import reads
+from rbl_gym.estimators.filter import belief_of, reads
 from rbl_gym.estimators.smoothing.knowledge import Level
 from rbl_gym.measurements.ranging import NoiseLaw
 
@@ -143,11 +143,11 @@ def next_step(
         predicted = filter.predict(state, told, dt)
         predicted = predicted if level is None else hold_level(state, predicted, level)
     state = _updated(filter, predicted, reading)
-    belief = filter.belief(state)
+    belief = belief_of(filter, state)
     if restart is not None and (other := restart(belief, reading.anchors)) is not None:
         predicted = filter.initial(*other)
         state = _updated(filter, predicted, reading)
-        belief = filter.belief(state)
+        belief = belief_of(filter, state)
     return Step(predicted, state, belief, reading)
 
 

@@ -195,7 +195,7 @@ def track_trials(
         times.append(taken)
         beliefs.append(step.belief)
         none = np.zeros(step.belief.translation.shape[:-1])
-        rows.append((*_own_variances(step.state), getattr(step.state, "constrained", none)))
+        rows.append((*_own_variances(step), getattr(step.state, "constrained", none)))
         advance()
     belief = stack_beliefs(beliefs)
     count = len(beliefs)
@@ -216,11 +216,12 @@ def track_trials(
     )
 
 
-def _own_variances(state: Any) -> tuple[FloatArray, FloatArray]:
+def _own_variances(step: Step) -> tuple[FloatArray, FloatArray]:
     """Return the variances of the Frobenius error of the rotation, and of the translation."""
-    variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
-    if isinstance(state, KalmanState):
+    if isinstance(step.state, KalmanState):
+        variance = np.diagonal(step.state.covariance, axis1=-2, axis2=-1)
         return variance[..., :9].sum(-1), variance[..., 9:].sum(-1)
+    variance = np.diagonal(step.belief.covariance, axis1=-2, axis2=-1)
     # |exp(w) Q - Q|_F^2 = 2 |w|^2 to first order.
     return 2 * variance[..., :3].sum(-1), variance[..., 3:6].sum(-1)
 

@@ -207,7 +207,7 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
           ``"reference-range"`` with `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`,
           `kappa` and `snr`.
         * If `n_anchors` changes but `anchors` does not, every reset draws the positions in the
-          anchor region.
+          anchor region. A file with positions of all anchors refuses another `n_anchors`.
         * ``"stretch": [x, y, z]`` multiplies the volume, the anchor region (box or walls), the
           anchors and the obstacles by a factor for each axis, after all other changes.
         * A ``"name"`` that ends in ``.toml`` or ``.json`` is the path of a file: overrides with the
@@ -241,6 +241,11 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
             imported("layout", READERS[".csv"])(scene["layout"]).positions
         )
     if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
+        if base.anchors and "anchors" not in changes and _gives_anchors(scene["name"]):
+            raise ValueError(
+                f"n_anchors must be {base.n_anchors}, the number of anchors in {scene['name']}, "
+                f"got {changes['n_anchors']!r:.80}; with anchors=None every reset draws them"
+            )
         changes.setdefault("anchors", None)
     anchors = changes.get("anchors")
     if anchors is not None:
@@ -273,6 +278,17 @@ def _named(name: Any) -> Scene:
             "a named scene: {'name': 'uwb_room', 'title': 'my room', ...}"
         )
     return SCENES[name]
+
+
+def _gives_anchors(name: str) -> bool:
+    """Return whether a scene with positions of anchors has them from a file."""
+    if name in SCENES:
+        return False
+    changes = scene_source.changes_in(name)
+    if changes is None:  # a building file
+        return True
+    own = "layout" in changes or changes.get("anchors") is not None
+    return own or _gives_anchors(changes["name"])
 
 
 def _stretched(scene: Scene, stretch: Any) -> Scene:

@@ -46,7 +46,7 @@ NLOS_PROBABILITY, NLOS_BIAS_M = 0.1, 5.0
 FILTERS = {
     "iekf": ("iekf", {"iterations": 2}, False),
     "iekf-bank": ("iekf-bank", {}, False),
-    "iekf, reflections": ("iekf", {"iterations": 4, "robust": True}, True),
+    "iekf/robust=true, reflections": ("iekf", {"iterations": 4, "robust": True}, True),
     "uc-kf": ("uc-kf", {}, False),
 }
 
