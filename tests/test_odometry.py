@@ -29,6 +29,7 @@ from rbl_gym.recordings.tables import Source
 from rbl_gym.recordings.truth import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay import smoothing as replay_smoothing
+from rbl_gym.studies.replay.clocks import _peak
 from tests import recorded
 from tests.helpers import with_kernels
 
@@ -501,3 +502,13 @@ def test_a_wrong_sensor_of_the_filter_is_named(odometry):
             process=motion.ProcessNoise(),
             odometry=odometry,
         )
+
+
+def test_the_peak_of_a_ragged_likelihood():
+    """The sharp bend between the finest steps is that of noise, not of the peak."""
+    x = [0.0, 0.1, 0.11, 0.14, 0.17, 0.2, 0.23, 0.26, 0.29, 0.3, 0.4]
+    y = [-6.2, -3.3, -3.9, -6.2, -9.4, 0.0, -1.1, -17.3, -18.1, -18.8, -29.2]
+    at, std = _peak(dict(zip(x, y, strict=True)), 0.2)
+    assert abs(at - 0.15) < 2 * std
+    exact = {a: -0.5 * ((a - 0.18) / 0.05) ** 2 for a in x}
+    assert _peak(exact, 0.17) == pytest.approx((0.18, 0.05))

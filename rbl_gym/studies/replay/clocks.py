@@ -23,6 +23,8 @@ __all__ = ["CLOCK_TRIALS", "SensorClock", "sensor_clock"]
 # Spacing of the tested offsets, first coarse, then finer, and their number on each side.
 _STEPS, _SIDES = (0.4, 0.1, 0.03), (7, 3, 3)
 CLOCK_TRIALS = len(_STEPS)
+# Offsets (s) about the best one that determine the peak.
+_NEAR_S = 0.25
 # Longest part used: in epochs, for an inertial sensor in ranges; and its search range (s).
 _MOST, _MOST_RANGES, _SEARCH_S = 1_500, 60_000, 10.0
 
@@ -94,14 +96,28 @@ def sensor_clock(
                 f"the search; give a rough offset (--time-offset {name.partition('_')[0]}=S)"
             )
         advance()
+    at, std = _peak({x: y for x, y in seen.items() if abs(x - best) < _NEAR_S}, best)
+    return SensorClock(at, std, max(seen.values()) - seen[round(given, 6)])
+
+
+def _peak(seen: dict[float, float], best: float) -> tuple[float, float]:
+    """Return the place of the peak of log-likelihoods by offset, and its standard deviation.
+
+    A parabola is fitted to all of them, and again to those within three standard deviations: the
+    curvature between the finest steps alone is too uncertain.
+    """
     fine = _STEPS[-1]
-    x = np.array([a for a in seen if abs(a - best) < 2.5 * fine])
-    y = np.array([seen[a] for a in x])
-    bend, slope, _ = np.polyfit(x - best, y, 2) if len(x) > 2 else (0.0, 0.0, 0.0)
-    std = float(1 / np.sqrt(-2 * bend)) if bend < 0 else fine
-    if bend < 0:
-        best += float(np.clip(-slope / (2 * bend), -fine, fine))
-    return SensorClock(best, max(std, 1e-4), max(seen.values()) - seen[round(given, 6)])
+    x, y = np.array(sorted(seen)), np.array([seen[a] for a in sorted(seen)])
+    std, step = fine, 0.0
+    near = np.ones(len(x), np.bool_)
+    for _ in range(2):
+        bend, slope, _ = np.polyfit(x[near] - best, y[near], 2)
+        if bend >= 0:
+            break
+        std = float(1 / np.sqrt(-2 * bend))
+        step = float(np.clip(-slope / (2 * bend), -2 * fine, 2 * fine))
+        near = np.abs(x - best) < max(3 * std, 2.5 * fine)
+    return best + step, max(std, 1e-4)
 
 
 def _inertial_clock(recording: Recording, settings: Settings) -> SensorClock:
