@@ -246,11 +246,12 @@ def factory_of(name: str | Callable[..., Filter]) -> Callable[..., Filter]:
         return found[0].load()
     if isinstance(name, str) and ":" in name:
         return imported("filter", name)
+    module, dot, factory = name.rpartition(".") if isinstance(name, str) else ("", "", "")
     raise ValueError(
         f"filter must be one of {', '.join(names())}, or a name given by "
         "rbl_gym.estimators.register, or 'module:factory', or a class or function that makes the "
         f"filter, got {name!r:.80}"
-        f"{did_you_mean(name, names())}"
+        + (f"; did you mean '{module}:{factory}'?" if dot else did_you_mean(name, names()))
     )
 
 

@@ -39,6 +39,8 @@ def said(capsys, *arguments):
         ),
         (["replay", *FILES, "--height-m", "1"], ".*; or set --planar, with which the height is"),
         (["bench", "--filters", "iekf,ikef"], "--filters: filter must be one of .* mean 'iekf'"),
+        (["bench", "--filters", "iekf", "my:Ekf"], "'my:Ekf'; separate the values of --filters by"),
+        (["bench", "--filters", "my.sub.Ekf"], "--filters: filter must be .* mean 'my.sub:Ekf'"),
         (["bench", "--conditions", "nlso"], "--conditions: condition must be .* mean 'nlos'"),
         (["evaluate", "mounts", "--references", "rign"], "--references: reference must be one of"),
         # The progress has begun when the error is found.

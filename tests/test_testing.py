@@ -361,3 +361,9 @@ def test_states_that_commands_cannot_take_apart_are_named():
 
     with pytest.raises(AssertionError, match="got dict: commands"):
         check_filter(Wrapped)
+
+
+def test_a_path_may_have_options():
+    check_filter("tests.fragile:stumbles/epoch=100000", skip=["pickling", "noise"])
+    with pytest.raises(AssertionError, match=r"update must accept valid arguments.*stumbled"):
+        check_filter("tests.fragile:stumbles/epoch=1")

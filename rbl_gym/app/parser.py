@@ -52,7 +52,9 @@ class Parser(argparse.ArgumentParser):
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             name = unknown[0].partition("=")[0]
-            near = did_you_mean(name, [*self._option_string_actions]) if name[:1] == "-" else ""
+            near = self._comma(unknown[0])
+            if name[:1] == "-":
+                near = did_you_mean(name, [*self._option_string_actions])
             self.error(f"unknown argument {unknown[0]!r}{near}")
         return options, unknown
 
@@ -64,6 +66,15 @@ class Parser(argparse.ArgumentParser):
             message += self._negative(found[1].split("/"))
         end = "" if message[-1] in ".?" else "."
         self.exit(2, f"{self.prog}: {message}{end} Help: {self.prog} --help\n")
+
+    def _comma(self, word: str) -> str:
+        """Return how to write several values of the option before a word, if it takes a list."""
+        before = self._typed[: self._typed.index(word)] if word in self._typed else []
+        option = next((name for name in reversed(before) if name[:2] == "--"), "")
+        action = self._option_string_actions.get(option.partition("=")[0])
+        if action is None or action.metavar != "A,B":
+            return ""
+        return f"; separate the values of {action.option_strings[0]} by commas, without spaces"
 
     def _negative(self, names: Sequence[str]) -> str:
         """Return how to write an option whose value begins with a minus sign."""

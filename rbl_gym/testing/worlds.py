@@ -6,6 +6,7 @@ import math
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,15 +105,18 @@ def require(condition: Any, message: str) -> None:
 
 
 def factory_of(make_filter: str | Callable[..., Any]) -> Callable[..., Any]:
-    """Return the factory of a path ``"module:factory"``, or the factory itself."""
+    """Return the factory of a path ``"module:factory"`` with options, or the factory itself."""
     if not isinstance(make_filter, str):
         return make_filter
+    from rbl_gym.estimators.filter import parse_filter
+
     if ":" not in make_filter:
         raise ValueError(
             "make_filter must be a class, a function or 'module:factory'; for a filter with a name "
             f"write functools.partial(estimators.make, {make_filter!r:.80})"
         )
-    return imported("make_filter", make_filter)
+    path, options = parse_filter(make_filter)
+    return partial(imported("make_filter", path), **options)
 
 
 @contextmanager
