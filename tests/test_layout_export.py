@@ -46,7 +46,11 @@ def test_the_list_says_how_high_which_way_and_how_far_from_walls(problem):
     assert [row["faces"] for row in rows] == ["+y", "-x", "-y", "down"]
     assert [row["name"] for row in rows] == ["1", "2", "3", "4"]
     # The slab's top is at 1.2 m.
-    assert [row["above_floor_m"] for row in rows] == pytest.approx([1.3, 0.8, 1.8, 2.3])
+    assert [row["above_floor_m"] for row in rows] == pytest.approx(ANCHORS[:, 2])
+    assert [row["above_slab_m"] for row in rows] == pytest.approx([1.3, 0.8, 1.8, 2.3])
+    assert [row["slab"] for row in rows] == ["slab 1"] * 4
+    (low,) = mounting_list(problem, np.array([[3.0, 0.0, 0.9]]))
+    assert (low["above_floor_m"], low["above_slab_m"], low["slab"]) == (0.9, "", "")
     assert rows[0]["mount"].startswith("hall")
     found = [
         [(one["side"], one["to"], one["distance_m"]) for one in row["measured"]] for row in rows

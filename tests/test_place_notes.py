@@ -278,6 +278,25 @@ def test_given_anchors_in_a_wall_or_just_off_a_mount_are_named():
     assert place_answer.question(placed.result)[0] == "How good are these 4 anchors in 'file'?"
 
 
+@pytest.mark.parametrize("side", ["left", "right", "both"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_mounts_on_the_outside_of_a_wall_are_named(side, turned):
+    line = [[0, 0], [12, 0]] if not turned else [[12, 0], [0, 0]]
+    wall = {"line": line, "thickness_m": 0.2, "high_m": 3}
+    mount = {"kind": "wall", "name": "south", "line": line, "low_m": 2, "high_m": 2.8}
+    tables = {"walls": [wall], "mounts": [*HALL["mounts"], mount | {"side": side}]}
+    notes = scene_files.of_mapping(HALL | tables).notes
+    # The hall is at the left of a wall along +x.
+    inside = "right" if turned else "left"
+    if side in (inside, "both"):
+        assert notes == ()
+    else:
+        assert notes == (
+            "Anchors on 'south' (mounts[1]) see no zone, but on the other side of the line they "
+            f'would: side is "{side}"; give side = "{inside}".',
+        )
+
+
 def test_given_anchors_on_no_mount_are_named_and_a_wrong_unit():
     problem = scene_files.of_mapping(HALL | {"anchors": {"number": 4, "fixed": [[6, 1, 2]]}})
     anchors = np.array([[0.5, 0.5, 3], [6, 4, 2.4], [15, 4, 3], [6, 1, 2], [1, 1, 3.005]])

@@ -84,12 +84,14 @@ def test_a_plan_goes_to_a_report_in_one_command(
     assert main(command) == 0
     shown = capsys.readouterr()
     assert "12 x 8" in shown.err  # what was read
+    assert "Assumed: an octahedron of 6 tags" in " ".join(shown.out.split())
     made = {path.suffix: path for path in (tmp_path / "new").iterdir()}
     assert all(str(path.relative_to(tmp_path)) in shown.out for path in made.values())
     if name == "office.dxf":
         assert made[".pdf"].read_bytes().startswith(b"%PDF")
     elif name == "office.geojson":
-        assert made[".csv"].read_text().startswith("name,x_m,y_m,z_m,mount,above_floor_m,faces")
+        head = "name,x_m,y_m,z_m,mount,above_floor_m,above_slab_m,slab,faces"
+        assert made[".csv"].read_text().startswith(head)
         assert made[".png"].stat().st_size > 50_000
     else:
         page = made[".html"].read_text(encoding="utf-8")
@@ -104,6 +106,8 @@ def test_plan_writes_a_file_that_place_reads(tmp_path, capsys):
     assert main([*command, "--zones", "zone,attitude=level,height_m=0.3"]) == 0
     shown = capsys.readouterr().out
     assert "layers of the drawing" in shown
+    assert "Assumed: an octahedron of 6 tags" in " ".join(shown.split())
+    assert "requirements, for example: position_m = 0.10" in out.read_text("utf-8")
     assert f"building: {out}" in shown
     assert picture.stat().st_size > 20_000
     problem = scene_files.problem(str(out))

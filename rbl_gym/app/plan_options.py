@@ -125,7 +125,7 @@ def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = No
 def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
     """Return the `Problem` of --scene: a named scene, a building file, or a plan with layers."""
     from rbl_gym.placement import building, scene_files
-    from rbl_gym.placement.plans import toml_text
+    from rbl_gym.placement.plans import layers, toml_text
 
     path = options.scene
     if not is_plan(path):
@@ -144,7 +144,8 @@ def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
         print(f"{path}: {line}", file=sys.stderr)
     tables = toml_text.plain(plan.tables)
     try:
-        return scene_files.of_mapping(tables, n_anchors, options.region, Path(path).stem)
+        found = scene_files.of_mapping(tables, n_anchors, options.region, Path(path).stem)
+        return dataclasses.replace(found, notes=(layers.ASSUMED, *found.notes))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

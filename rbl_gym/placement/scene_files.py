@@ -32,6 +32,7 @@ from rbl_gym.placement.file_tables import as_table, check_text, read_table
 from rbl_gym.placement.file_walls import Built, read_mounts, read_obstacles, show
 from rbl_gym.placement.mounting import cut_mounts
 from rbl_gym.placement.outline import outside
+from rbl_gym.placement.sides import wrong_sides
 from rbl_gym.worlds import scenes
 
 __all__ = ["Problem", "inside", "load", "of_mapping", "problem", "with_anchors"]
@@ -173,7 +174,8 @@ def of_mapping(
     if not lists["mounts"]:
         return found
     mounts = read_mounts(lists["mounts"], built.walls)
-    return replace(found, notes=outside(found, built.walls, mounts))
+    notes = outside(found, built.walls, mounts)
+    return replace(found, notes=notes + wrong_sides(found, lists["mounts"], built.walls, mounts))
 
 
 def with_anchors(problem: Problem, n_anchors: int) -> Problem:

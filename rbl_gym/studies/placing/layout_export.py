@@ -15,7 +15,7 @@ from rbl_gym.placement.plans.drawing import UNITS
 from rbl_gym.placement.scene_files import Problem
 from rbl_gym.recordings.writing import write_table
 from rbl_gym.studies.placing.given import mount_names
-from rbl_gym.studies.placing.tape import direction, floor_below, measured_from
+from rbl_gym.studies.placing.tape import direction, measured_from, slab_below
 
 __all__ = ["LAYER", "SUFFIXES", "mounting_list", "write_layout"]
 
@@ -31,10 +31,11 @@ def mounting_list(
 ) -> list[dict[str, Any]]:
     """Return what is needed to mount each anchor, as plain values.
 
-    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name, or
-    ``no mount``), ``above_floor_m`` (height above z =
-    0, or above the top of the slab below), ``faces`` (``down``, ``+x``, an angle from +x in
-    degrees, or ``any``), and ``measured``: up to two distances from walls (`tape.measured_from`).
+    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name, or ``no mount``), ``above_floor_m``
+    (height above the floor of the building, z = 0), ``above_slab_m`` and ``slab`` (height above the
+    slab between that floor and the anchor, and its name; empty texts without one), ``faces``
+    (``down``, ``+x``, an angle from +x in degrees, or ``any``), and ``measured``: up to two
+    distances from walls (`tape.measured_from`).
 
     Parameters
     ----------
@@ -49,6 +50,7 @@ def mounting_list(
     rows = []
     for name, anchor, mount, normal in zip(names, anchors, mounts, normals, strict=True):
         x, y, z = (round(value, 3) + 0.0 for value in anchor.tolist())
+        top, slab = slab_below(problem, anchor)
         rows.append(
             {
                 "name": name,
@@ -56,7 +58,9 @@ def mounting_list(
                 "y_m": y,
                 "z_m": z,
                 "mount": mount,
-                "above_floor_m": round(z - floor_below(problem, anchor), 3),
+                "above_floor_m": z,
+                "above_slab_m": round(z - top, 3) if slab else "",
+                "slab": slab,
                 "faces": direction(normal),
                 "measured": measured_from(problem, anchor, normal),
             }

@@ -36,13 +36,21 @@ _ACROSS = 0.5
 
 def floor_below(problem: Problem, point: FloatArray) -> float:
     """Return the height of the floor below a point (3,): the top of the highest slab, or 0."""
-    prisms = problem.obstacles.prisms
-    tops = [0.0]
-    for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
+    return slab_below(problem, point)[0]
+
+
+def slab_below(problem: Problem, point: FloatArray) -> tuple[float, str]:
+    """Return the top and the name of the highest slab between z = 0 and a point; 0, "" if none."""
+    prisms, boxes = problem.obstacles.prisms, len(problem.obstacles.boxes)
+    top, found = 0.0, ""
+    for k, ring in enumerate(prisms.corners):
+        low, high = float(prisms.low_m[k]), float(prisms.high_m[k])
         slab = high - low <= _SLAB_M and abs(area(ring)) >= _SLAB_M2
-        if slab and high <= point[2] and contains(ring, point[None, :2], -1e-3)[0]:
-            tops.append(float(high))
-    return max(tops) if point[2] >= 0 else 0.0
+        if slab and top < high <= point[2] and contains(ring, point[None, :2], -1e-3)[0]:
+            names = problem.obstacle_names
+            # Without its position in the plan, which is that of the anchor.
+            top, found = high, names[boxes + k].rpartition(" (")[0] if names else "slab"
+    return top, found
 
 
 def direction(normal: FloatArray) -> str:
