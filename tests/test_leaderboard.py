@@ -345,6 +345,27 @@ def test_trials_need_only_the_belief_of_a_filter(one_by_one):
     np.testing.assert_allclose(trace.own_translation[0], 3 * 0.5**2, rtol=0.5)
 
 
+@pytest.mark.parametrize(
+    ("changes", "noted"),
+    [
+        ({}, True),
+        ({"initial_translation_m": 0.1}, False),
+        ({"survey_std_m": 0.1}, False),
+        ({"links": {"nlos_probability": 0.1}}, False),
+    ],
+)
+def test_an_optimistic_iekf_gets_a_note_on_the_linearisation(tmp_path, capsys, changes, noted):
+    # Five anchors within 10 cm of a plane.
+    path = tmp_path / "flat.json"
+    anchors = [[0, 0, 2.4], [6, 0, 2.3], [6, 5, 2.4], [0, 5, 2.3], [3, 0, 2.4]]
+    flat = {"anchors": anchors, "initial_translation_m": 2.0, "noise": {"floor_m": 0.02}}
+    path.write_text(json.dumps(SHORT | flat | changes))
+    assert bench(tmp_path, "--scenes", path, "--filters", "iekf", "--conditions", "nominal",
+                 "--trials", "100")[0] == 0  # fmt: skip
+    shown = " ".join(capsys.readouterr().out.split())
+    assert ("the probable cause is the linearisation" in shown) == noted
+
+
 def test_the_table_of_stress_has_the_ratio_to_the_bound(tmp_path, short, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
     bench(tmp_path, "--scenes", short, "--conditions", "nlos", "--filters", "iekf,kf",
