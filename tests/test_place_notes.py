@@ -7,7 +7,14 @@ import pytest
 
 pytest.importorskip("shapely", reason="needs the extra placement")
 
-from rbl_gym.app import place_answer, place_figures, place_pdf, place_report, place_svg
+from rbl_gym.app import (
+    place_answer,
+    place_figures,
+    place_pdf,
+    place_report,
+    place_summary,
+    place_svg,
+)
 from rbl_gym.app import place_shapes as shapes
 from rbl_gym.app.place_notes import (
     cause_of,
@@ -328,3 +335,55 @@ def test_the_first_page_has_all_zones_above_the_footnote(tmp_path):
     table = place_report.tables(placed.result)
     shown = next(one for one in table if "worst without" in one.headings)
     assert {row[-1] for row in shown.rows} <= {"1", "2", "3", "4"} | {"P", "Q"}
+
+
+def test_one_tag_has_no_heading_anywhere(capsys):
+    """The figure would be that of the prior, 60 deg."""
+    zone = HALL["zones"][0] | {"position_m": 0.5, "share": 0.9}
+    del zone["heading_deg"]
+    problem = scene_files.of_mapping(HALL | {"zones": [zone], "body": {"tags": [[0, 0, 0]]}})
+    placed = place_anchors(problem, Question(range(4, 5), layout=ANCHORS, trials=20))
+    result = placed.result
+    assert set(result["zones"][0]["heading_deg"].values()) == {None}
+    assert [q.field for q in shapes.quantities(problem)] == ["horizontal"]
+    for details in (False, True):
+        place_summary.print_place(result, details)
+    shown = capsys.readouterr().out
+    texts = [page_text(page) for page in place_pdf.report_pages(placed)]
+    assert "heading not determined" in " ".join(texts)
+    for text in (shown, *texts):
+        assert "60.0" not in text
+    # Two tags determine it.
+    two = scene_files.of_mapping(HALL)
+    assert [q.field for q in shapes.quantities(two)] == ["horizontal", "heading"]
+
+
+def page_text(page):
+    return " ".join(text.get_text() for text in page.texts)
+
+
+def test_the_table_of_zones_has_the_error_at_the_required_share(capsys):
+    placed = place_anchors(
+        scene_files.of_mapping(HALL), Question(range(4, 5), layout=ANCHORS, trials=4)
+    )
+    (zone,) = placed.result["zones"]
+    (judged,) = judge(placed.problem, ANCHORS, 0)
+    errors = np.sort(judged.judged.horizontal)
+    assert zone["position_m"]["at_share"] == errors[int(np.ceil(0.9 * len(errors))) - 1]
+    place_summary.print_place(placed.result)
+    shown = capsys.readouterr().out
+    assert "horizontal p90 (m)" in shown
+    assert "p95" not in shown
+    other = zone | {"required": zone["required"] | {"share": 0.8}}
+    place_summary.print_place(placed.result | {"zones": [zone, other]})
+    shown = capsys.readouterr().out
+    assert "(p90)" in shown
+    assert "(p80)" in shown
+
+
+def test_a_lone_no_of_the_filter_that_is_not_told_is_explained():
+    told, blind = {"holds": True}, {"holds": False}
+    filters = {"iterated EKF": told, "iterated EKF, not told": blind}
+    assert "does not contradict the verdict" in place_answer.only_not_told({"filters": filters})
+    filters["iterated EKF"] = blind
+    assert place_answer.only_not_told({"filters": filters}) == ""

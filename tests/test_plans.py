@@ -225,7 +225,7 @@ def test_layers_are_mapped_by_patterns_the_first_that_matches():
     ("text", "message"),
     [
         ("walls ,material=brick", "LAYER,KEY=VALUE"),
-        ("walls A,colour=red", "unknown key 'colour'; the keys are material"),
+        ("walls A,colour=red", "unknown key 'colour'; the keys are name, material"),
         ("walls A,low_m=high", "low_m must be a number, got 'high'"),
         ("walls A,material=cheese", "material must be one of drywall, .* information=SHARE"),
     ],
@@ -399,3 +399,35 @@ def test_layers_keep_the_use_of_their_name_beside_options():
     assert layers.building(drawing, uses("walls D")).used == {"D": ["walls"], "zones": ["zones"]}
     made = layers.building(drawing, uses("obstacles wall*"))
     assert made.used == {"Walls": ["obstacles"], "zones": ["zones"]}
+
+
+def test_heights_and_names_of_a_wall_that_also_carries_mounts():
+    """The wall's height only limits its mounts; their own high_m counts."""
+    own = [
+        {"name": "north", "height": 5},
+        {"name": "gate", "min_height": 4, "height": 5},
+        {"name": "low", "height": 2.5},
+        {"name": 7, "height": 5, "high_m": 4.2},
+    ]
+    shapes = [
+        drawing.Shape("W", "LineString", np.array([[0.0, y], [9.0, y]]), False, (), properties)
+        for y, properties in enumerate(own)
+    ]
+    told = uses("walls W", "mounts W,low_m=3,high_m=4.8")
+    made = layers.building(plan_of(*shapes), told, 5.0)
+    tables = made.tables
+    assert [(wall["name"], wall["low_m"], wall["high_m"]) for wall in tables["walls"]] == [
+        ("north", 0.0, 5.0), ("gate", 4.0, 5.0), ("low", 0.0, 2.5), ("7", 0.0, 4.2),
+    ]  # fmt: skip
+    assert [(one["name"], one["low_m"], one["high_m"]) for one in tables["mounts"]] == [
+        ("north", 3.0, 4.8), ("gate", 4.0, 4.8), ("7", 3.0, 4.2),
+    ]  # fmt: skip
+    assert "layer W, read as mounts: 1 walls end below the mounts, and carry none" in made.said
+
+
+def test_mounts_of_one_name_are_numbered():
+    rings = [np.array(DESK, float) + shift for shift in (0, 4)]
+    shapes = [drawing.Shape("COLUMNS", "LWPOLYLINE", ring, True) for ring in rings]
+    use = parse_use("mounts", "COLUMNS,kind=column")
+    mounts = layers.building(plan_of(*shapes), [use]).tables["mounts"]
+    assert [one["name"] for one in mounts] == ["COLUMNS 1", "COLUMNS 2"]

@@ -124,9 +124,9 @@ def table(title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]]) ->
     )
 
 
-def digits(value: float, count: int) -> str:
-    """Format with this many significant digits, with trailing zeros."""
-    return f"{value:#.{count}g}".rstrip(".")
+def digits(value: float | None, count: int) -> str:
+    """Format with this many significant digits, with trailing zeros; None: a dash."""
+    return "-" if value is None else f"{value:#.{count}g}".rstrip(".")
 
 
 def _cell(value: Any, kind: str) -> str:

@@ -139,7 +139,11 @@ def typical(zones: list[dict[str, Any]]) -> str:
     parts = []
     for key in ("position_m", "heading_deg"):
         name, unit = NAMES[key]
-        medians = sorted(zone[key]["median"] for zone in zones)
+        found = [zone[key]["median"] for zone in zones]
+        if None in found:
+            parts.append(f"{name} not determined")
+            continue
+        medians = sorted(found)
         span = digits(medians[0])
         if digits(medians[-1]) != span:
             span += f" to {digits(medians[-1])}"
@@ -183,12 +187,37 @@ def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
                 f"{percent(zone['share_high'])})"
             )
         figures = ", ".join(
-            f"{name} {digits(zone[key]['median'])} {unit} (95 %: {digits(zone[key]['p95'])})"
+            f"{name} not determined"
+            if zone[key]["median"] is None
+            else f"{name} {digits(zone[key]['median'])} {unit} "
+            f"({100 * share_of(zone):g} %: {digits(zone[key]['at_share'])})"
             for key, (name, unit) in NAMES.items()
             if key in zone
         )
         found.append(ZoneAnswer(zone["name"], zone["verdict"], asks, reached, figures))
     return found
+
+
+def share_of(zone: dict[str, Any]) -> float:
+    """Return the required share of a zone; 0.95 without a requirement."""
+    return zone["required"]["share"] if "required" in zone else 0.95
+
+
+def share_heading(zones: list[dict[str, Any]]) -> str:
+    """Return the heading of the errors that are not exceeded in the required share: ``p95``."""
+    shares = {f"p{100 * share_of(zone):g}" for zone in zones}
+    return shares.pop() if len(shares) == 1 else "at share"
+
+
+def only_not_told(check: dict[str, Any]) -> str:
+    """Return why a ``no`` of the filter that is not told does not count; ``""`` if others do."""
+    wrong = [name for name, figures in check["filters"].items() if not figures["holds"]]
+    if len(wrong) != 1 or not wrong[0].endswith("not told"):
+        return ""
+    return (
+        f"The 'no' of {wrong[0]!r} does not contradict the verdict: this filter is not told which "
+        "links are blocked, and the prediction assumes that they are known."
+    )
 
 
 def without_name(result: dict[str, Any], row: dict[str, Any]) -> str | None:
@@ -205,6 +234,8 @@ def percent(share: float) -> str:
     return f"{text.removesuffix('.0')} %"
 
 
-def digits(value: float) -> str:
-    """Format three digits, without exponents in the usual range."""
+def digits(value: float | None) -> str:
+    """Format three digits, without exponents in the usual range; None: a dash."""
+    if value is None:
+        return "-"
     return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

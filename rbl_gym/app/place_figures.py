@@ -229,6 +229,9 @@ def _draw_numbers(axes: Any, rows: list[dict[str, float]]) -> None:
         (axes, "position", "m", DESIGNED),
         (other, "rotation", "deg", OTHER),
     ):
+        if rows[0][f"{key}_median_{unit}"] is None:
+            ax.set_yticks([])
+            continue
         for what, style in (("median", "o-"), ("p95", "s--"), ("worst", "^:")):
             if f"{key}_{what}_{unit}" not in rows[0]:
                 continue

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
-from rbl_gym.app.place_answer import WORDS, typical, without_name
+from rbl_gym.app.place_answer import WORDS, share_heading, typical, without_name
 from rbl_gym.app.place_loss import loss_tables
 from rbl_gym.app.place_survey import survey_table
 
@@ -78,7 +78,7 @@ def verdict(result: dict[str, Any]) -> str:
 def notes(result: dict[str, Any]) -> list[str]:
     """Return notes on the tables and warnings, one or two sentences each."""
     criteria, check = result["criteria"], result["check"]
-    conditioning = criteria["conditioning"]
+    conditioning, turn = criteria["conditioning"], criteria["rotation_rad"]
     found = [
         "A place meets the requirement if the errors of horizontal position, height and heading "
         "are within their limits. An error is one sigma, from one epoch of ranges (root mean "
@@ -88,7 +88,7 @@ def notes(result: dict[str, Any]) -> list[str]:
         "Predicted: Cramer-Rao bound of all three axes together; b is the root mean square tag "
         "error.",
         f"Criteria: position {criteria['position_m']:.4g} m, rotation "
-        f"{math.degrees(criteria['rotation_rad']):.3g} deg, D-optimal "
+        f"{'-' if turn is None else f'{math.degrees(turn):.3g}'} deg, D-optimal "
         f"{criteria['d_optimal_m']:.4g} m, E-optimal {criteria['e_optimal_m']:.4g} m, conditioning "
         + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
         f"Check: {check['trials']} bodies at random poses, equally many in each zone; the EKF "
@@ -106,9 +106,9 @@ def notes(result: dict[str, Any]) -> list[str]:
             found.append(
                 f"{name}: {100 * (1 - figures['found']):.3g} % of the bodies are not found. For "
                 "the others the RMSE of the position is "
-                + _figure(figures.get("position_rmse_found_m"), 4)
+                + digits(figures.get("position_rmse_found_m"), 4)
                 + " m, "
-                + _figure(figures.get("position_ratio_found"), 3)
+                + digits(figures.get("position_ratio_found"), 3)
                 + " times the predicted one."
             )
     if result["obstacles"]:
@@ -126,14 +126,15 @@ def _zones(result: dict[str, Any]) -> Rows:
         figures = [
             f"{digits(row[key][what], n)}"
             for key, n in (("position_m", 3), ("heading_deg", 3))
-            for what in ("median", "p95")
+            for what in ("median", "at_share")
         ]
         rows.append(
             [row["name"], WORDS[row["verdict"]], *_share(row), *figures, without_name(result, row)]
         )
+    what = share_heading(result["zones"])
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
-        "horizontal median (m)", "p95", "heading median (deg)", "p95",
+        "horizontal median (m)", what, "heading median (deg)", what,
     ]  # fmt: skip
     if any(row[-1] is not None for row in rows):
         return Rows(title(result), [*headings, "worst without"], [_texts(row) for row in rows])
@@ -147,10 +148,6 @@ def title(result: dict[str, Any]) -> str:
 
 def _texts(row: list[Any]) -> list[str]:
     return ["-" if cell is None else str(cell) for cell in row]
-
-
-def _figure(value: float | None, n: int) -> str:
-    return "-" if value is None else digits(value, n)
 
 
 def _percent(share: float) -> str:
@@ -187,7 +184,7 @@ def fewest_rows(fewest: dict[str, Any]) -> Iterator[Rows]:
         if "share" not in row:
             continue
         needs = row["would_pass"]
-        values = [_figure(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
+        values = [digits(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
         factor = f"{needs['factor']:.3f}"
         rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *values, factor])
     headings = [
@@ -219,7 +216,10 @@ def _without(result: dict[str, Any]) -> Rows:
     for anchor in result["anchors"]:
         left = anchor["without"]
         shares = [_percent(row["share"]) for row in left["zones"] if "share" in row]
-        worst = [max(row[key] for row in left["zones"]) for key in ("position_m", "heading_deg")]
+        worst = [
+            max((row[key] for row in left["zones"] if row[key] is not None), default=None)
+            for key in ("position_m", "heading_deg")
+        ]
         rows.append(
             [
                 anchor["name"],
@@ -293,7 +293,8 @@ def _prediction(result: dict[str, Any]) -> Rows:
         ("score_m", "b (m)"),
     ):
         figures = result["predicted"][key]
-        where = "(" + ", ".join(f"{x:.3g}" for x in figures["worst_at_m"]) + ")"
+        at = figures["worst_at_m"]
+        where = "-" if at is None else "(" + ", ".join(f"{x:.3g}" for x in at) + ")"
         rows.append(
             [
                 label,
@@ -343,7 +344,7 @@ def _check(check: dict[str, Any]) -> Rows:
         row = [name, _percent(figures["found"]), "yes" if figures["holds"] else "no"]
         for quantity, unit, n in (("position", "m", 4), ("rotation", "deg", 3)):
             for key in ("rmse_{}", "p95_{}", "predicted_{}"):
-                row.append(_figure(figures.get(f"{quantity}_{key.format(unit)}"), n))
+                row.append(digits(figures.get(f"{quantity}_{key.format(unit)}"), n))
             ratio = figures.get(f"{quantity}_ratio")
             row.append("-" if ratio is None else f"{ratio:.3f}")
         rows.append([*row, f"{figures['nees']:.2f}" if "nees" in figures else "-"])
@@ -369,10 +370,10 @@ def _check_within(check: dict[str, Any]) -> Rows:
             _percent(row["found"]),
             _percent(row["within"]),
             _percent(row["within_predicted"]),
-            _figure(row.get("position_rmse_m"), 3),
-            _figure(row.get("position_predicted_m"), 3),
-            _figure(row.get("heading_rmse_deg"), 3),
-            _figure(row.get("heading_predicted_deg"), 3),
+            digits(row.get("position_rmse_m"), 3),
+            digits(row.get("position_predicted_m"), 3),
+            digits(row.get("heading_rmse_deg"), 3),
+            digits(row.get("heading_predicted_deg"), 3),
         ]
         for name, figures in check["filters"].items()
         for row in figures["zones"]

@@ -19,6 +19,7 @@ from rbl_gym.studies.placing.accuracy import Map, accuracy_map
 from rbl_gym.studies.placing.answer import Placed
 from rbl_gym.studies.placing.judging import limits_of
 from rbl_gym.studies.placing.tape import floor_below
+from rbl_gym.studies.placing.undetermined import has_heading
 
 # Blue and vermilion of Okabe and Ito, distinguishable by everyone, and in grey.
 WITHIN, BEYOND, NOTHING = "#56b4e9", "#d55e00", "#c9ced2"
@@ -63,10 +64,12 @@ _PLAIN = (
 def quantities(problem: Problem) -> list[Quantity]:
     """Return the quantities to map: the required ones, otherwise position and orientation."""
     asked = {q.field for q in _ASKED for z in problem.zones if q.limit_of(z) is not None}
+    # What the tags do not determine would be a map of the prior.
+    known = 2 if has_heading(problem) else 1
     if not asked and all(zone.attitude == "free" for zone in problem.zones):
-        return list(_PLAIN)
-    found = [q for q in _ASKED if q.field in asked]
-    return found or list(_ASKED[:2])
+        return list(_PLAIN[:known])
+    found = [q for q in _ASKED if q.field in asked and (known == 2 or q.field != "heading")]
+    return found or list(_ASKED[:known])
 
 
 def has_requirement(problem: Problem) -> bool:

@@ -6,7 +6,16 @@ from collections.abc import Iterator
 from typing import Any
 
 from rbl_gym.app.page import digits
-from rbl_gym.app.place_answer import HOW_TO_ASK, WORDS, percent, warnings, without_name
+from rbl_gym.app.place_answer import (
+    HOW_TO_ASK,
+    WORDS,
+    only_not_told,
+    percent,
+    share_heading,
+    share_of,
+    warnings,
+    without_name,
+)
 from rbl_gym.app.place_loss import loss_tables
 from rbl_gym.app.place_report import (
     Rows,
@@ -40,6 +49,8 @@ def print_place(result: dict[str, Any], details: bool = False) -> None:
         for row in rows.rows:
             table.add_row(*row)
         console.print(table)
+    if not details and (why := only_not_told(result["check"])):
+        console.print(why)
     if not details and result["next_anchor"] is not None:
         console.print(next_anchor(result))
     for warning in found:
@@ -84,9 +95,13 @@ def _zones(result: dict[str, Any]) -> Rows:
     zones = result["zones"]
     asks = any("share" in row for row in zones)
     heights = any(row.get("required", {}).get("height_m") is not None for row in zones)
-    keys = [("position_m", "horizontal p95 (m)"), ("heading_deg", "heading p95 (deg)")]
+    what = share_heading(zones)
+    alike = what != "at share"
+    # Each cell names its share if they differ.
+    what = f" {what}" if alike else ""
+    keys = [("position_m", f"horizontal{what} (m)"), ("heading_deg", f"heading{what} (deg)")]
     if heights:
-        keys.insert(1, ("height_m", "height p95 (m)"))
+        keys.insert(1, ("height_m", f"height{what} (m)"))
     rows = []
     for row in zones:
         cells = [row["name"]]
@@ -94,7 +109,10 @@ def _zones(result: dict[str, Any]) -> Rows:
             cells += [WORDS[row["verdict"]], percent(row["share"]), f"{row['margin']:.3f}"]
         elif asks:
             cells += ["-"] * 3
-        cells += [digits(row[key]["p95"], 3) for key, _ in keys]
+        mark = "" if alike else f" (p{100 * share_of(row):g})"
+        for key, _ in keys:
+            value = row[key]["at_share"]
+            cells.append(digits(value, 3) + mark * (value is not None))
         if result["survive"]:
             cells.append(without_name(result, row) or "-")
         if asks:

@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _HELP = {
-    "walls": "lines that weaken links: material, as in material=concrete, thickness_m, "
+    "walls": "lines that weaken links: name, material, as in material=concrete, thickness_m, "
     "side_by_side_m (largest distance of two lines that are one wall)",
-    "obstacles": "areas that weaken links and where the body cannot be: material, low_m, high_m",
+    "obstacles": "areas that weaken links and where the body cannot be: name, material, low_m, "
+    "high_m",
     "zones": "areas where the body works, and what they require: name, low_m, high_m, weight, "
     "attitude (free, level or heading), position_m, height_m, heading_deg, share",
     "mounts": "where anchors may be mounted: kind (wall, ceiling, column, area or points), low_m, "

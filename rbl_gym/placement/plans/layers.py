@@ -18,26 +18,19 @@ from rbl_gym.placement.plans.pairs import centre_lines
 from rbl_gym.placement.plans.parts import (
     count_blocks,
     lines_of,
+    numbered,
     outline_of,
     points_of,
     rounded,
     spots_of,
 )
-from rbl_gym.placement.plans.uses import KEYS, KINDS, TEXTS, Use, number
+from rbl_gym.placement.plans.uses import KEYS, KINDS, Use
+from rbl_gym.placement.plans.values import mount_values, values_of
 
 __all__ = ["Building", "building"]
 
 # Default heights, metres.
 ZONE_M, _MOUNT_LOW_M, _BELOW_CEILING_M = (0.5, 2.0), 2.0, 0.2
-# Names of the keys in other programs.
-_PROPERTIES = {
-    "height": "high_m",
-    "min_height": "low_m",
-    "base": "low_m",
-    "thickness": "thickness_m",
-}
-
-
 # Defaults for values that a plan does not contain.
 DEVICES: dict[str, Any] = {
     "body": {"shape": "octahedron", "size_m": 0.8},
@@ -87,8 +80,10 @@ def building(
         If a layer does not exist, or a material has no known information fraction.
     """
     uses = list(uses)
+    every = [*uses, *_by_name(drawing, uses)]
     made = _Maker(drawing, height_m)
-    for use in [*uses, *_by_name(drawing, uses)]:
+    made.solid = [use.layer for use in every if use.kind in ("walls", "obstacles")]
+    for use in every:
         layers = [name for name in drawing.layers() if _matches(name, use.layer)]
         if not layers:
             raise ValueError(
@@ -148,6 +143,7 @@ class _Maker:
         self.height = height_m
         self.found: dict[str, list[Any]] = {kind: [] for kind in KINDS}
         self.used: dict[str, list[str]] = {}
+        self.solid: list[str] = []
         self.said: list[str] = []
 
     def take(self, layer: str, use: Use) -> None:
@@ -217,7 +213,7 @@ class _Maker:
         return rows, left
 
     def _mounts(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
-        rows, left, kind = [], [], use.values.get("kind")
+        rows, left, short, kind = [], [], [], use.values.get("kind")
         top = self.height - _BELOW_CEILING_M
         sides = {"low_m": min(_MOUNT_LOW_M, 0.7 * self.height), "high_m": top}
         name = {"name": layer}
@@ -235,8 +231,11 @@ class _Maker:
                 allowed = ("name", "low_m", "high_m", "side", "cost")
                 side = {"side": "left" if line.closed else "both"}
                 ring = {"closed": True} if line.closed else {}
-                values = self._values(line, use, allowed, name | sides | side)
+                values = self._mount(line, use, allowed, name | sides | side)
                 points = line.points
+                if values["high_m"] < values["low_m"]:
+                    short.append(line)
+                    continue
                 if line.closed and area(points) < 0:  # counter-clockwise: left is inside
                     points = points[::-1]
                 rows.append({"kind": own, "line": points_of(points), **ring, **values})
@@ -247,9 +246,12 @@ class _Maker:
                 flat = own == "ceiling"
                 allowed = ("name", "cost", *(("height_m",) if flat else ("low_m", "high_m")))
                 heights = {"height_m": self.height} if flat else sides
-                values = self._values(line, use, allowed, name | heights)
+                values = self._mount(line, use, allowed, name | heights)
                 rows.append({"kind": own, "polygon": points_of(ring), **values})
-        return _commented(rows, layer), [(len(left), "shapes that are not closed were left out")]
+        return _commented(rows, layer), [
+            (len(left), "shapes that are not closed were left out"),
+            (len(short), "walls end below the mounts, and carry none"),
+        ]
 
     def _fixed(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
         return spots_of(marks, lines, use), [
@@ -276,28 +278,14 @@ class _Maker:
     def _values(
         self, shape: Shape | None, use: Use, keys: Iterable[str], usual: dict[str, Any]
     ) -> dict[str, Any]:
-        """Return the values of an entry: of the shape, else of the layer, else the defaults."""
-        said = {}
-        for key, value in ({} if shape is None else shape.properties).items():
-            key = _PROPERTIES.get(key, key)
-            if key in keys and value is not None:
-                said[key] = value if key in TEXTS else number(f"{use.layer}: {key}", value)
-        values = usual | {key: use.values[key] for key in use.values if key in keys} | said
-        if "material" in values and values["material"] not in MATERIALS:
-            other = values.pop("material")
-            if "information" not in values:
-                raise ValueError(
-                    f"{self.drawing.path}: layer {use.layer}: material must be one of "
-                    f"{', '.join(MATERIALS)}, got {other!r:.80}; for another material give "
-                    "information=SHARE, the share (0 to 1) that remains behind it"
-                )
-        elif "material" in values and "information" in values:
-            values.pop("information" if "material" in said else "material")
-        return {
-            key: rounded(values[key]) if isinstance(values[key], float) else values[key]
-            for key in keys
-            if key in values
-        }
+        return values_of(self.drawing.path, shape, use, keys, usual)
+
+    def _mount(
+        self, shape: Shape, use: Use, keys: Iterable[str], usual: dict[str, Any]
+    ) -> dict[str, Any]:
+        solid = any(_matches(shape.layer, name) for name in self.solid)
+        make = mount_values if solid else values_of
+        return make(self.drawing.path, shape, use, keys, usual)
 
     # --- the whole -------------------------------------------------------------------------------
 
@@ -345,6 +333,7 @@ class _Maker:
                 }
             ]
 
+        numbered(self.found["mounts"])
         taken: set[str] = set()
         zones: list[dict[str, Any]] = self.found["zones"]
         for zone in zones:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from typing import Any
+
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.plans.drawing import Shape
 from rbl_gym.placement.plans.rings import joined, opened
@@ -40,6 +43,17 @@ def outline_of(shape: Shape) -> FloatArray:
     """Return a ring with its holes connected to it, as far as possible."""
     ring = opened(shape.points, shape.holes) if shape.holes else shape.points
     return shape.points if ring is None else ring
+
+
+def numbered(rows: list[dict[str, Any]]) -> None:
+    """Number the names of rows that have the same name: COLUMNS 1, COLUMNS 2."""
+    counts = Counter(row["name"] for row in rows if "name" in row)
+    done: Counter[str] = Counter()
+    for row in rows:
+        name = row.get("name", "")
+        if counts[name] > 1:
+            done[name] += 1
+            row["name"] = f"{name} {done[name]}"
 
 
 def count_blocks(marks: list[Shape]) -> int:

@@ -14,8 +14,16 @@ __all__ = ["KEYS", "KINDS", "Use", "parse_use"]
 # Kinds of use, with the allowed keys of their entries: those of the file, and `side_by_side_m`, the
 # maximum distance of the two lines of a wall.
 KEYS = {
-    "walls": ("material", "information", "thickness_m", "low_m", "high_m", "side_by_side_m"),
-    "obstacles": ("material", "information", "low_m", "high_m"),
+    "walls": (
+        "name",
+        "material",
+        "information",
+        "thickness_m",
+        "low_m",
+        "high_m",
+        "side_by_side_m",
+    ),
+    "obstacles": ("name", "material", "information", "low_m", "high_m"),
     "zones": (
         *("name", "low_m", "high_m", "weight", "attitude"),
         *("position_m", "height_m", "heading_deg", "share"),

@@ -34,6 +34,7 @@ from rbl_gym.studies.placing.judging import (
 )
 from rbl_gym.studies.placing.lever import lever_row
 from rbl_gym.studies.placing.surveys import survey_rows
+from rbl_gym.studies.placing.undetermined import has_heading, without_heading
 from rbl_gym.studies.progress import Advance, silent
 
 __all__ = ["Placed", "Question", "place_anchors"]
@@ -132,7 +133,8 @@ def place_anchors(problem: Problem, question: Question, advance: Advance = silen
             found = _designed(problem, question, start, advance)
             start = found.anchors
             judged = judge(problem, start, seed, survive)
-            rows.append({"n_anchors": number, **_summary(problem, start, judged)})
+            row = {"n_anchors": number, **_summary(problem, start, judged)}
+            rows.append(row if has_heading(problem) else without_heading(row))
         assert found is not None
     judged = judge(problem, found.anchors, seed, survive)
     advance()
@@ -237,7 +239,7 @@ def _result(
         "layouts": _comparison(problem, found, judged, seed, survive),
         "check": check.check_layout(problem, anchors, question.trials, seed),
     }
-    return result
+    return result if has_heading(problem) else without_heading(result)
 
 
 def _obstacles(problem: Problem) -> list[dict[str, Any]]:

@@ -229,10 +229,11 @@ def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
     """Return `short_row` with the distribution of the errors, and the worst positions.
 
     ``position_m`` (horizontal), ``height_m``, ``heading_deg`` and ``score_m`` have ``rms``,
-    ``median``, ``p95`` and ``worst``. The worst value and ``worst_places``, which are apart from
-    each other, include the edges of the zone. If any one anchor may fail, ``any_loss`` has the same
-    figures of the errors after the loss of the anchor that hurts most at each position, and with a
-    requirement the ``share`` of the positions that meet it after the loss of any one anchor.
+    ``median``, ``p95``, ``worst`` and ``at_share``: the error that is not exceeded in the required
+    share of the zone, 0.95 without a requirement. The worst value and ``worst_places``, which are
+    apart from each other, include the edges of the zone. If any one anchor may fail, ``any_loss``
+    has the figures of the errors after the loss of the anchor that hurts most at each position, and
+    with a requirement the ``share`` of the positions that meet it after the loss of any one anchor.
 
     Parameters
     ----------
@@ -243,7 +244,8 @@ def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
     for name, values in told(judged.judged).items():
         del row[f"rms_{name}"]
         worst = max(values.max(), told(edges.errors)[name].max(initial=0.0))
-        row[name] = {**_spread(values), "worst": float(worst)}
+        at_share = float(value_at_share(values, judged.zone.share))
+        row[name] = {**_spread(values), "worst": float(worst), "at_share": at_share}
     if judged.without is not None:
         row["any_loss"] = _any_loss(judged, judged.without)
     inner = Judged(judged.zone, judged.places, judged.judged)
