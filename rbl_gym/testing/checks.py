@@ -63,9 +63,8 @@ def check_filter(
     ----------
     make_filter
         Called as ``make_filter(tags=..., noise=..., process=...)``; the factory that is registered
-        or of an entry point of ``rbl_gym.filters``; or its path ``"module:factory"``, also with
-        options, ``"module:factory/option=1.5"``. A filter with
-        ``reads = "inertial"`` gets the readings of a default `InertialSensor` instead of twists.
+        or of an entry point of ``rbl_gym.filters``; or its path ``"module:factory/option=1.5"``. A
+        filter with ``reads = "inertial"`` gets the readings of an `InertialSensor`, not twists.
     skip
         Checks to leave out, by the names below.
     seed

@@ -108,14 +108,14 @@ def factory_of(make_filter: str | Callable[..., Any]) -> Callable[..., Any]:
     """Return the factory of a path ``"module:factory"`` with options, or the factory itself."""
     if not isinstance(make_filter, str):
         return make_filter
-    from rbl_gym.estimators.filter import parse_filter
-
     if ":" not in make_filter:
         raise ValueError(
             "make_filter must be a class, a function or 'module:factory'; for a filter with a name "
             f"write functools.partial(estimators.make, {make_filter!r:.80})"
         )
-    path, options = parse_filter(make_filter)
+    # By its path, as this package imports no estimator.
+    parse = imported("make_filter", "rbl_gym.estimators.filter:parse_filter")
+    path, options = parse(make_filter)
     return partial(imported("make_filter", path), **options)
 
 
