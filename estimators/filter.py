@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, did_you_mean, imported
+from rbl_gym.checks import FloatArray, check_array, did_you_mean, imported, parse_filter
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
@@ -179,48 +179,6 @@ def make(
                 f"got {type(made).__name__} without {method}"
             )
     return made
-
-
-def parse_filter(text: Any, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-    """Parse ``name/option=value/option=value`` to the name of a filter and its options.
-
-    Parameters
-    ----------
-    text
-        Name of a filter, with or without options. A value is JSON (``true``, ``0.05``,
-        ``[1, 2]``), or else text (``late``). A factory is returned as it is.
-    options
-        Further options.
-
-    Raises
-    ------
-    ValueError
-        If a part is not ``option=value``, or an option is given twice.
-
-    Examples
-    --------
-    >>> parse_filter("iekf-log/robust=late/iterations=2")
-    ('iekf-log', {'robust': 'late', 'iterations': 2})
-    """
-    name, *parts = text.strip().split("/") if isinstance(text, str) else (text,)
-    result: dict[str, Any] = dict(options or {})
-    for part in parts:
-        key, equals, value = part.partition("=")
-        if not key or not equals:
-            raise ValueError(
-                f"filter {text!r:.80} must have the form name/option=value/..., got {part!r}"
-            )
-        if key in result:
-            raise ValueError(f"filter {text!r:.80} has the option {key!r} twice")
-        try:
-            result[key] = json.loads(_PYTHON.get(value, value))
-        except json.JSONDecodeError:
-            result[key] = value
-    return name, result
-
-
-# Values as Python writes them.
-_PYTHON = {"True": "true", "False": "false", "None": "null"}
 
 
 def filter_text(name: str | Callable[..., Filter], options: Mapping[str, Any]) -> str:

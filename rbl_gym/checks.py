@@ -11,8 +11,9 @@ import difflib
 import functools
 import importlib
 import inspect
+import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -309,3 +310,45 @@ def imported(name: str, path: str) -> Callable[..., Any]:
     if not callable(found):
         raise ValueError(f"{name} {path!r:.80} must be callable, got {found!r:.80}")
     return found
+
+
+def parse_filter(text: Any, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    """Parse ``name/option=value/option=value`` to the name of a filter and its options.
+
+    Parameters
+    ----------
+    text
+        Name of a filter, with or without options. A value is JSON (``true``, ``0.05``,
+        ``[1, 2]``), or else text (``late``). A factory is returned as it is.
+    options
+        Further options.
+
+    Raises
+    ------
+    ValueError
+        If a part is not ``option=value``, or an option is given twice.
+
+    Examples
+    --------
+    >>> parse_filter("iekf-log/robust=late/iterations=2")
+    ('iekf-log', {'robust': 'late', 'iterations': 2})
+    """
+    name, *parts = text.strip().split("/") if isinstance(text, str) else (text,)
+    result: dict[str, Any] = dict(options or {})
+    for part in parts:
+        key, equals, value = part.partition("=")
+        if not key or not equals:
+            raise ValueError(
+                f"filter {text!r:.80} must have the form name/option=value/..., got {part!r}"
+            )
+        if key in result:
+            raise ValueError(f"filter {text!r:.80} has the option {key!r} twice")
+        try:
+            result[key] = json.loads(_PYTHON.get(value, value))
+        except json.JSONDecodeError:
+            result[key] = value
+    return name, result
+
+
+# Values as Python writes them.
+_PYTHON = {"True": "true", "False": "false", "None": "null"}

@@ -103,9 +103,7 @@ _LOSS = {
         "text", "one of [materials] or a standard material; opaque without material and information"
     ),
     "information": Key(
-        "number",
-        "share of a link's information that remains behind it; give this or material, not both",
-        **_SHARE,
+        "number", "share of a link's information that remains; give it or material", **_SHARE
     ),
 }
 _REACH = {
@@ -235,8 +233,7 @@ FORMAT: dict[str, Table] = {
                     "closed": _CLOSED,
                     "side": Key(
                         "choice",
-                        "side of the line where anchors are mounted; the left of a closed line is "
-                        "its inside",
+                        "where to mount anchors; the left of a closed line is its inside",
                         default="left",
                         choices=("left", "right", "both"),
                     ),

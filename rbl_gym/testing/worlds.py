@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import metrics, motion
-from rbl_gym.checks import FloatArray, imported
+from rbl_gym.checks import FloatArray, imported, parse_filter
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import inertial, ranging
 
@@ -113,9 +113,7 @@ def factory_of(make_filter: str | Callable[..., Any]) -> Callable[..., Any]:
             "make_filter must be a class, a function or 'module:factory'; for a filter with a name "
             f"write functools.partial(estimators.make, {make_filter!r:.80})"
         )
-    # By its path, as this package imports no estimator.
-    parse = imported("make_filter", "rbl_gym.estimators.filter:parse_filter")
-    path, options = parse(make_filter)
+    path, options = parse_filter(make_filter)
     return partial(imported("make_filter", path), **options)
 
 
