@@ -94,12 +94,15 @@ class OtherState(Tuples):
 
     def predict(self, state: Any, twist: Any, dt: float) -> Any:
         """As the iterated EKF does."""
-        found = self.inner.predict(self.inner.initial(*state.mean, state.spread), twist, dt)
+        rotation, translation = state.mean
+        inner = self.inner.initial(rotation, translation, state.spread)
+        found = self.inner.predict(inner, twist, dt)
         return _Pair(found[:2], found[2])
 
     def belief(self, state: Any) -> Any:
         """All four fields."""
-        return estimators.PoseBelief(*state.mean, state.spread, state.mean[0])
+        rotation, translation = state.mean
+        return estimators.PoseBelief(rotation, translation, state.spread, rotation)
 
 
 not_callable = 3
