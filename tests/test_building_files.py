@@ -20,6 +20,7 @@ from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import building, criteria, scene_files
 from rbl_gym.placement.file_keys import FORMAT, MATERIALS
 from rbl_gym.placement.file_schema import schema
+from rbl_gym.placement.file_tables import read_table
 from rbl_gym.placement.wall_lines import wall_pieces
 from tests.helpers import ROOT, changed_tables, needs
 
@@ -456,6 +457,12 @@ BAD = [
     ("zones.1.position_m", None, "zones[1].share needs one of position_m, height_m"),
     ("zones.0.attitude", "up", "zones[0].attitude must be one of 'free', 'level', 'heading'"),
     ("zones.1.name", "open plan", "zones[1].name must differ from the names of the other zones"),
+    ("body", [{"shape": "cube"}], "body must be one table [body], as a file has one body; got 1"),
+    (
+        "zones.0.known_height_m",
+        2,
+        "zones[0] has an unknown key 'known_height_m'; it may have polygon",
+    ),
     ("plan", {"images": "x"}, "plan has an unknown key 'images'"),
     ("plan", {"metres_per_pixel": 0}, "plan.metres_per_pixel must be a finite number"),
     ("plan", {"image": "a.png"}, "plan.metres_per_pixel must be given with plan.image"),
@@ -663,3 +670,8 @@ def test_a_layout_without_any_sight_of_some_positions_is_judged():
     found = criteria.criteria(problem, problem.context, anchors)
     assert found.conditioning >= 1e12 * (1 - 1e-9)
     assert all(np.isfinite(value) for value in found)
+
+
+def test_a_known_height_is_not_taken_for_a_requirement():
+    with pytest.raises(ValueError, match=r"place always estimates the height, .*high_m$"):
+        read_table("zones", {"known_height_m": 2.2, "polygon": [[0, 0], [1, 0], [1, 1]]})

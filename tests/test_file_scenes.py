@@ -376,6 +376,8 @@ def test_common_errors_of_toml_say_what_to_do(tmp_path):
     for text, words in (
         ("[walls]\nhigh_m = 3\n[walls]\n", r"twice.*: write \[\[walls\]\] for each"),
         ("[walls]\nhigh_m = 10 cm  # low\n", "line 2.*: values are numbers without units"),
+        ("[body]\nsize_m = 0.8\n[body]\n", r"twice.*: a file has one \[body\]$"),
+        ("[walls]\nhigh_m = 0,15  # low\n", "line 2.*: numbers have a decimal point, 0.15"),
         ("[walls]\nhigh_m = = 10\n", "line 2, column 10\\)$"),
     ):
         path.write_text(text)

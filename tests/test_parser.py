@@ -46,6 +46,8 @@ def said(capsys, *arguments):
         # The progress has begun when the error is found.
         (["bounds", "--scene", "hal"], "--scene must be one of .* did you mean 'hall'"),
         (["place", "uwb_room", "--fewest"], "--fewest needs a requirement"),
+        (["place", "F", "--fewest", "5"], "--fewest takes no value; .* by --anchors A..B"),
+        (["place", "F", "--fewest=5"], "--fewest takes no value; .* by --anchors A..B"),
         (["place", "uwb_room", "--anchors", "x"], "--anchors: must be N or A..B, .* got 'x'"),
         (["convert", "--list", "x.bag"], "LOG must be given, before --list"),
         (["plac"], "did you mean 'place'"),

@@ -143,7 +143,7 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
         (["plan", "x.png", "--walls", "A"], "a picture has no layers: leave out --walls"),
         (["plan", "x.geojson", "--zones", "A,attitude=up"], "attitude must be one of free, level"),
         (["plan", "x.geojson", "--mounts", "A,kind=roof"], "--mounts A: kind must be one of wall"),
-        (["plan", "x.geojson", "--walls", "A,x=1"], "unknown key 'x'; the keys are material"),
+        (["plan", "x.geojson", "--walls", "A,x=1"], "unknown key 'x'; the keys are name, material"),
         (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),
         (["place", "--scene", "uwb_room", "--walls", "A"], "--walls needs a drawing"),
         (["place", "--scene", "uwb_room", "--report", "x.doc"], "--report must end in .pdf"),
@@ -214,6 +214,16 @@ def test_floors_do_not_hide_the_zones_in_a_plan():
     assert len(shapes.solids(problem)) == 2
     (table,) = shapes.solids_in_plan(problem)
     assert (table.low_m, table.high_m) == (0.0, 0.5)
+
+
+def test_slabs_are_outlined_with_name_and_heights():
+    deck = {"name": "deck", "polygon": [[0, 0], [6, 0], [6, 8], [0, 8]], "z_m": 2.5}
+    problem = scene_files.of_mapping(OVER | {"slabs": [deck | {"thickness_m": 0.2}]})
+    (axes,) = place_figures.building_figure(problem).axes
+    assert "deck, z 2.5 to 2.7 m" in [text.get_text() for text in axes.texts]
+    outlines = [patch for patch in axes.patches if patch.get_linestyle() == ":"]
+    assert [len(one.get_xy()) for one in outlines] == [5]
+    assert "dotted brown: slabs" in place_figures.legend_text(problem)
 
 
 def test_the_wall_above_a_door_is_drawn_as_overhead(placed):

@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             name = unknown[0].partition("=")[0]
-            near = self._comma(unknown[0])
+            near = self._comma(unknown[0]) or self._no_value()
             if name[:1] == "-":
                 near = did_you_mean(name, [*self._option_string_actions])
             self.error(f"unknown argument {unknown[0]!r}{near}")
@@ -64,6 +64,8 @@ class Parser(argparse.ArgumentParser):
             message += did_you_mean(found[1], [name.strip("'") for name in found[2].split(", ")])
         if found := _NO_VALUE.search(message):
             message += self._negative(found[1].split("/"))
+        if "ignored explicit argument" in message:
+            message += self._no_value()
         end = "" if message[-1] in ".?" else "."
         self.exit(2, f"{self.prog}: {message}{end} Help: {self.prog} --help\n")
 
@@ -75,6 +77,16 @@ class Parser(argparse.ArgumentParser):
         if action is None or action.metavar != "A,B":
             return ""
         return f"; separate the values of {action.option_strings[0]} by commas, without spaces"
+
+    def _no_value(self) -> str:
+        """Return that an option takes no value, if a number was typed after it."""
+        words = [part for word in self._typed for part in word.split("=", 1)]
+        for option, value in itertools.pairwise(words):
+            action = self._option_string_actions.get(option)
+            if action is not None and action.nargs == 0 and re.fullmatch(r"[\d.]+", value):
+                instead = "; give the allowed numbers by --anchors A..B"
+                return f"; {option} takes no value{instead * (option == '--fewest')}"
+        return ""
 
     def _negative(self, names: Sequence[str]) -> str:
         """Return how to write an option whose value begins with a minus sign."""

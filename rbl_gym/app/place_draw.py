@@ -15,8 +15,9 @@ from rbl_gym.app import place_shapes as shapes
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.polygons import area
 from rbl_gym.placement.scene_files import Problem
+from rbl_gym.studies.placing.tape import slabs_of
 
-MOUNT, ANCHOR, KEPT, ZONE = "#7b3294", "#111111", "#6b6b6b", "#222222"
+MOUNT, ANCHOR, KEPT, ZONE, SLAB = "#7b3294", "#111111", "#6b6b6b", "#222222", "#8a4b08"
 COLOURS = "viridis_r"
 # Labels of more anchors than this are without heights, so that they fit; the list has the heights.
 _MOST_HEIGHTS = 16
@@ -50,6 +51,7 @@ def draw_building(axes: Any, problem: Problem, anchors: FloatArray, names: bool 
         ),
         autolim=False,
     )
+    _draw_slabs(axes, problem, names)
     if not shapes.is_far(problem, anchors):
         lines, areas = shapes.mount_shapes(problem)
         axes.add_collection(
@@ -69,6 +71,29 @@ def draw_building(axes: Any, problem: Problem, anchors: FloatArray, names: bool 
     if names and len(problem.zones) > 1:
         for text, at in shapes.zone_labels(problem, anchors):
             axes.text(*at, text, fontsize=8, ha="center", va="center", zorder=6, bbox=_WHITE)
+
+
+def _draw_slabs(axes: Any, problem: Problem, names: bool) -> None:
+    """Draw the outlines of slabs, with their names and heights at the upper left corner."""
+    taken: list[FloatArray] = []
+    for ring, low, high, name in slabs_of(problem):
+        axes.add_patch(Polygon(ring, fill=False, ec=SLAB, lw=1.2, ls=":", zorder=3.2))
+        if not names:
+            continue
+        corner = ring[(ring[:, 1] - ring[:, 0]).argmax()]
+        below = sum(bool(np.abs(corner - other).max() < 1.0) for other in taken)
+        taken.append(corner)
+        axes.annotate(
+            f"{name}, z {low:g} to {high:g} m",
+            corner,
+            xytext=(5, -5 - 9 * below),
+            textcoords="offset points",
+            fontsize=6.5,
+            color=SLAB,
+            ha="left",
+            va="top",
+            zorder=6,
+        )
 
 
 def _draw_backdrop(axes: Any, problem: Problem) -> None:

@@ -15,6 +15,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement.scene_files import Problem
 from rbl_gym.studies.placing.accuracy import Map
 from rbl_gym.studies.placing.answer import Placed
+from rbl_gym.studies.placing.tape import slabs_of
 
 DESIGNED, USUAL, OTHER = "#0072b2", "#9db4c0", "#d55e00"
 # Width of a map in the picture, its largest height, height of a chart alone: inches.
@@ -136,6 +137,8 @@ def legend_text(problem: Problem) -> str:
         parts.append("grey: obstacles, darker if they weaken links more")
     if any(shapes.is_overhead(problem, solid) for solid in shapes.solids_in_plan(problem)):
         parts.append("dotted: overhead")
+    if slabs_of(problem):
+        parts.append("dotted brown: slabs")
     return "     ".join(parts)
 
 

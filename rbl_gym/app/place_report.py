@@ -124,8 +124,8 @@ def _zones(result: dict[str, Any]) -> Rows:
     rows = []
     for row in result["zones"]:
         figures = [
-            f"{digits(row[key][what], n)}"
-            for key, n in (("position_m", 3), ("heading_deg", 3))
+            digits(row[key][what], 3)
+            for key in ("position_m", "heading_deg")
             for what in ("median", "at_share")
         ]
         rows.append(
@@ -180,13 +180,11 @@ def fewest_rows(fewest: dict[str, Any]) -> Iterator[Rows]:
     if less is None:
         return
     rows = []
-    for row in less["zones"]:
-        if "share" not in row:
-            continue
+    for row in (row for row in less["zones"] if "share" in row):
         needs = row["would_pass"]
         values = [digits(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
-        factor = f"{needs['factor']:.3f}"
-        rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *values, factor])
+        values.append(f"{needs['factor']:.3f}")
+        rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *values])
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
         "would pass: horizontal (m)", "height (m)", "heading (deg)", "or all limits x",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from rbl_gym.placement.file_keys import FORMAT
+
 # Start of an error message: a table, perhaps with an index, perhaps with a key.
 _SUBJECT = re.compile(r"^([A-Za-z_]\w*)(?:\[(\d+)\])?(?:(?:\.|: )([A-Za-z_]\w*))?")
 
@@ -12,6 +14,9 @@ _TWICE = re.compile(r"Cannot declare \('(\w+)',\) twice")
 _AT = re.compile(r"at line (\d+)")
 # A number that is followed by a unit.
 _UNIT = re.compile(r"^\s*\w+\s*=\s*[-+]?[\d.]+\s*[A-Za-z%\u00b0]+\s*(#.*)?$")
+
+# A number with a decimal comma.
+_COMMA = re.compile(r"^\s*\w+\s*=\s*[-+]?(\d+),(\d+)\s*(#.*)?$")
 
 _UNKNOWN = re.compile(r"unknown key '(\w+)'")
 
@@ -54,9 +59,15 @@ def advice(data: bytes, message: str) -> str:
         The error.
     """
     if twice := _TWICE.search(message):
+        table = FORMAT.get(twice[1])
+        if table is not None and not table.many:
+            return f": a file has one [{twice[1]}]"
         return f": write [[{twice[1]}]] for each"
     lines = data.decode("utf-8", errors="replace").split("\n")
     at = _AT.search(message)
-    if at and int(at[1]) <= len(lines) and _UNIT.match(lines[int(at[1]) - 1]):
+    line = lines[int(at[1]) - 1] if at and int(at[1]) <= len(lines) else ""
+    if comma := _COMMA.match(line):
+        return f": numbers have a decimal point, {comma[1]}.{comma[2]}"
+    if _UNIT.match(line):
         return ": values are numbers without units; the unit is in the name of the key"
     return ""

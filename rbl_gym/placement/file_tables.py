@@ -16,6 +16,8 @@ from rbl_gym.placement.file_keys import FORMAT, MOST_M, Form, Key
 _FARTHEST_M = 1e9
 # Limit of the number of points in a list.
 _MOST_POINTS = 10_000
+# What to say of keys that are asked for, but do not exist.
+_NO_KEYS = {"known_height_m": "; place always estimates the height, also if low_m = high_m"}
 
 
 def read_table(name: str, table: Any, kind: str | None = None) -> dict[str, Any]:
@@ -56,6 +58,11 @@ def _form(name: str, table: Mapping[str, Any], forms: tuple[Form, ...]) -> Form:
 
 def as_table(value: Any, name: str) -> dict[str, Any]:
     """Return a table of keys; raises ValueError for anything else."""
+    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        raise ValueError(
+            f"{name} must be one table [{name}], as a file has one {name}; got {len(value)} "
+            f"[[{name}]]"
+        )
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} must be a table of keys, got {value!r:.80}")
     return dict(value)
@@ -67,7 +74,7 @@ def check_keys(table: Mapping[str, Any], name: str, keys: Mapping[str, Key]) -> 
         if key not in keys:
             raise ValueError(
                 f"{name} has an unknown key {key!r:.80}; it may have {', '.join(keys)}"
-                f"{did_you_mean(key, keys)}"
+                f"{_NO_KEYS.get(key) or did_you_mean(key, keys)}"
             )
     for key, what in keys.items():
         if what.needed and key not in table:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,17 +39,35 @@ def floor_below(problem: Problem, point: FloatArray) -> float:
     return slab_below(problem, point)[0]
 
 
-def slab_below(problem: Problem, point: FloatArray) -> tuple[float, str]:
-    """Return the top and the name of the highest slab between z = 0 and a point; 0, "" if none."""
+class Slab(NamedTuple):
+    """A slab: its outline (V, 2), lower and upper height, and name."""
+
+    ring: FloatArray
+    low_m: float
+    high_m: float
+    name: str
+
+
+def slabs_of(problem: Problem) -> list[Slab]:
+    """Return the slabs above z = 0: obstacles as large and as thin as a floor."""
     prisms, boxes = problem.obstacles.prisms, len(problem.obstacles.boxes)
-    top, found = 0.0, ""
+    found = []
     for k, ring in enumerate(prisms.corners):
         low, high = float(prisms.low_m[k]), float(prisms.high_m[k])
-        slab = high - low <= _SLAB_M and abs(area(ring)) >= _SLAB_M2
-        if slab and top < high <= point[2] and contains(ring, point[None, :2], -1e-3)[0]:
+        if high - low <= _SLAB_M and abs(area(ring)) >= _SLAB_M2 and high > 0:
             names = problem.obstacle_names
-            # Without its position in the plan, which is that of the anchor.
-            top, found = high, names[boxes + k].rpartition(" (")[0] if names else "slab"
+            # Without its position in the plan, which the names of a file end with.
+            name = names[boxes + k].rpartition(" (")[0] if names else "slab"
+            found.append(Slab(ring, low, high, name))
+    return found
+
+
+def slab_below(problem: Problem, point: FloatArray) -> tuple[float, str]:
+    """Return the top and the name of the highest slab between z = 0 and a point; 0, "" if none."""
+    top, found = 0.0, ""
+    for ring, _, high, name in slabs_of(problem):
+        if top < high <= point[2] and contains(ring, point[None, :2], -1e-3)[0]:
+            top, found = high, name
     return top, found
 
 
