@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -224,6 +225,14 @@ def test_slabs_are_outlined_with_name_and_heights():
     outlines = [patch for patch in axes.patches if patch.get_linestyle() == ":"]
     assert [len(one.get_xy()) for one in outlines] == [5]
     assert "dotted brown: slabs" in place_figures.legend_text(problem)
+    names, at = [{"name": "A"}, {"name": "B"}], np.array([[1.0, 1, 3.0], [9, 1, 2.9]])
+    design = SimpleNamespace(anchors=at)
+    head, first, second = place_pdf.mounting_rows(
+        SimpleNamespace(problem=problem, design=design, result={"anchors": names})
+    )
+    where = slice(head.index("z, above floor [m]"), head.index("mount"))
+    assert first[where] == ["3.000", "0.30 above deck"]
+    assert second[where] == ["2.900", "-"]
 
 
 def test_the_wall_above_a_door_is_drawn_as_overhead(placed):

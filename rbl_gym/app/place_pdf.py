@@ -68,16 +68,15 @@ def report_pages(placed: Placed) -> Iterator[Figure]:
 
 def mounting_rows(placed: Placed) -> list[list[str]]:
     """Return the mounting list as texts, headings first."""
-    headings = ["anchor", "x [m]", "y [m]", "z [m]", "above floor, z = 0 [m]", "mount", "faces"]
+    headings = ["anchor", "x [m]", "y [m]", "z, above floor [m]", "mount", "faces"]
     found = mounting_list(placed.problem, placed.design.anchors, place_figures.anchor_names(placed))
     slabs = any(row["slab"] for row in found)
     if slabs:
-        headings.insert(5, "above slab [m]")
+        headings.insert(4, "above slab [m]")
     rows = [[*headings, "measured from", "and from"]]
     for row in found:
         ends = [measured_text(one) for one in row["measured"]]
         cells = [row["name"], *(f"{row[key]:.3f}" for key in ("x_m", "y_m", "z_m"))]
-        cells.append(f"{row['above_floor_m']:.2f}")
         if slabs:
             cells.append(f"{row['above_slab_m']:.2f} above {row['slab']}" if row["slab"] else "-")
         cells += [row["mount"], row["faces"]]

@@ -98,8 +98,9 @@ def notes(result: dict[str, Any]) -> list[str]:
         "exceeds once in a million.",
     ]
     found.append(
-        "Mounting list: left and right are as you face the wall; other distances are at right "
-        "angles to the wall. The point of the wall can be seen from the anchor."
+        "Mounting list: z is above the floor of the building, z = 0; above slab: above the top of "
+        "the slab that is named. Left and right are as you face the wall; other distances are at "
+        "right angles to the wall. The point of the wall can be seen from the anchor."
     )
     for name, figures in check["filters"].items():
         if 1 - figures["found"] > _MANY_LOST:
