@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,13 +224,12 @@ def test_slabs_are_outlined_with_name_and_heights():
     (axes,) = place_figures.building_figure(problem).axes
     assert "deck, z 2.5 to 2.7 m" in [text.get_text() for text in axes.texts]
     outlines = [patch for patch in axes.patches if patch.get_linestyle() == ":"]
-    assert [len(one.get_xy()) for one in outlines] == [5]
+    assert [len(np.array(one.get_path().vertices)) for one in outlines] == [5]
     assert "dotted brown: slabs" in place_figures.legend_text(problem)
     names, at = [{"name": "A"}, {"name": "B"}], np.array([[1.0, 1, 3.0], [9, 1, 2.9]])
     design = SimpleNamespace(anchors=at)
-    head, first, second = place_pdf.mounting_rows(
-        SimpleNamespace(problem=problem, design=design, result={"anchors": names})
-    )
+    made: Any = SimpleNamespace(problem=problem, design=design, result={"anchors": names})
+    head, first, second = place_pdf.mounting_rows(made)
     where = slice(head.index("z, above floor [m]"), head.index("mount"))
     assert first[where] == ["3.000", "0.30 above deck"]
     assert second[where] == ["2.900", "-"]

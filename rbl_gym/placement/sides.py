@@ -60,4 +60,4 @@ def _seeing(problem: Problem, faces: list[Mount]) -> BoolArray:
         points += [[*spot, z] for spot in plan for z in (face.low_m, face.high_m)]
     places = problem.free_places(_PLACES)
     seen = (problem.share(np.array(points), places) >= _SEEN).any(axis=0)
-    return seen.reshape(len(faces), -1).any(axis=1)
+    return np.any(seen.reshape(len(faces), -1), axis=1)
