@@ -93,6 +93,7 @@ def _draw_slabs(axes: Any, problem: Problem, names: bool) -> None:
             ha="left",
             va="top",
             zorder=6,
+            bbox=_WHITE | {"boxstyle": "square,pad=0.05", "ec": "none"},
         )
 
 
