@@ -20,7 +20,9 @@ from rbl_gym.placement.plans import (
     rings,
     toml_text,
 )
+from rbl_gym.placement.plans.drawing import Shape
 from rbl_gym.placement.plans.uses import KEYS, KINDS, Use, parse_use
+from rbl_gym.placement.plans.values import mount_values
 from tests.helpers import needs
 from tests.plan_files import DESK, INNER, MEETING, OUTER, write_dxf, write_geojson, write_png
 
@@ -431,3 +433,12 @@ def test_mounts_of_one_name_are_numbered():
     use = parse_use("mounts", "COLUMNS,kind=column")
     mounts = layers.building(plan_of(*shapes), [use]).tables["mounts"]
     assert [one["name"] for one in mounts] == ["COLUMNS 1", "COLUMNS 2"]
+
+
+@pytest.mark.parametrize(("wall", "high"), [({"height": 5.0}, 4.8), ({"height": 3.0}, 3.0)])
+def test_the_height_of_a_wall_only_limits_that_of_its_mounts(wall, high):
+    line = np.array([[0.0, 0.0], [4.0, 0.0]])
+    shape = Shape("W", "line", line, False, (), wall)
+    use = Use("mounts", "W", {"high_m": 4.8})
+    found = mount_values("plan.geojson", shape, use, ("low_m", "high_m"), {"low_m": 2.0})
+    assert found == {"low_m": 2.0, "high_m": high}

@@ -13,8 +13,6 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.recordings.truth import Truth
 
-__all__ = ["Spell", "frozen_notes", "frozen_spells", "renewed"]
-
 # Shortest reported spell (s).
 _SHORTEST_S = 0.2
 # The ranges of a link are compared in at most so many parts of a spell, of at least so many ranges.

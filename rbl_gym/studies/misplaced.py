@@ -10,8 +10,6 @@ import scipy
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.calibration import robust
 
-__all__ = ["ANCHOR_M", "LEFT", "MOST_OFF_M", "Misplaced", "misplaced"]
-
 # Cables, antennas and reflections shift the ranges of UWB links by about 0.05 m relative to each
 # other. Six times this is the largest offset of a link, and the smallest move, that are taken for a
 # fault; four times this the offset of an anchor.

@@ -10,8 +10,6 @@ from rbl_gym.placement.plans.drawing import Shape
 from rbl_gym.placement.plans.parts import rounded
 from rbl_gym.placement.plans.uses import TEXTS, Use, number
 
-__all__ = ["mount_values", "values_of"]
-
 # Names of the keys in other programs.
 _PROPERTIES = {
     "height": "high_m",
@@ -67,6 +65,11 @@ def mount_values(
     """Return `values_of` for a mount on a wall or obstacle of the same layer.
 
     The heights of the wall do not replace those of the mount; they only limit them.
+
+    Parameters
+    ----------
+    path, shape, use, keys, usual
+        As in `values_of`; the shape is the wall, the use that of the mount.
     """
     own = shape.properties
     rest = {key: own[key] for key in own if _PROPERTIES.get(key) not in ("low_m", "high_m")}

@@ -9,8 +9,6 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.studies.misplaced import ANCHOR_M, LEFT, MOST_OFF_M, misplaced
 
-__all__ = ["few", "outliers"]
-
 # Fewest ranges of a link that tell its offset.
 _FEWEST = 10
 

@@ -15,8 +15,6 @@ from rbl_gym.studies.replay.evidence import Trial, evidence
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track
 
-__all__ = ["anchor_note"]
-
 # An anchor is examined if its bias is above this (m), or if a move of it leaves less than this
 # share of the variance of its ranges.
 _STRANGE_M, _STRANGE = 0.1, 0.8
