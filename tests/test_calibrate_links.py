@@ -445,3 +445,13 @@ def test_a_real_recording_at_a_third_of_its_rate():
     assert found.figures["turn"]["rotation_vector_deg"][2] == pytest.approx(7, abs=1)
     assert found.figures["noise"]["std_m"] == pytest.approx(0.058, abs=0.008)
     assert found.fit.bias_m.mean() == pytest.approx(0.12, abs=0.03)
+
+
+def test_clocks_of_two_epochs_are_refused_with_the_offset():
+    times = 0.1 * np.arange(100)
+    ranges = ranges_of(times, np.random.default_rng(3))
+    rotation, place = path_of(times)
+    recording = recording_of(times + 1763550004.137, ranges, Truth(times, rotation, place))
+    for told in ("auto", -1763550600.0):
+        with pytest.raises(ValueError, match=r"behind by about 1763550004\.137 s, and auto .* 1 s"):
+            calibrate.calibrate_links(recording, LinkSettings(time_offset=told))

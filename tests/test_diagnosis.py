@@ -328,3 +328,32 @@ def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     out = capsys.readouterr().out
     assert "anchor A3" in out
     assert "20.0" in out
+
+
+def test_a_wrong_height_that_the_biases_of_the_filter_absorb_is_named():
+    """A planar body, 0.5 m lower than told: no anchor is blamed, and a right height passes."""
+    rng = np.random.default_rng(4)
+    times = 0.1 * np.arange(200)
+    place = np.array([5.0, 4, 1.0]) + np.stack(
+        [3 * np.sin(0.5 * times), 2.4 * np.sin(0.37 * times), 0 * times], -1
+    )
+    turn = rotations.exp((0.6 * times)[:, None] * [0, 0, 1.0])
+    true = ranging.distances(ANCHORS, ranging.tag_positions(turn, place, TAGS))
+    log = recorded.recording(times, true + 0.08 * rng.standard_normal(true.shape), ANCHORS, TAGS)
+    for height_m, named in ((1.5, True), (1.0, False)):
+        settings = replay.Settings.of(planar=True, height_m=height_m)
+        notes = replay.replay_recording(log, settings).figures["notes"]
+        warnings = [note for note in notes if note.startswith("WARNING")]
+        assert len(warnings) == named, warnings
+        if named:
+            found = re.search(r"another height: try --height-m=(\S+)\. The filter", warnings[0])
+            assert found, warnings
+            assert float(found[1]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_tuning_says_why_it_used_no_more_epochs():
+    found = {"epochs": 3000, "seconds": 27.5, "options": "--filter iekf"}
+    found |= {"log_likelihood": 1.0, "log_likelihood_before": 0.5}
+    text = consistency.tuned_text(found)
+    assert text.startswith("tuned on 3000 epochs (the most that are used) of the first 27.5 s: --f")
+    assert "most" not in consistency.tuned_text(found | {"epochs": 2999})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,26 @@ def test_a_clock_that_is_ahead():
     _, result = replayed(truth, time_offset=1.4e9)
     assert result.figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
     assert compared(result.figures)[1] == "the truth's clock is ahead by 1400000000 s (time_offset)"
+
+
+def test_a_suggested_offset_includes_the_given_one():
+    """Milliseconds are kept beside ten digits of seconds; the suggested value works as it is."""
+    ahead = -1763550004.137
+    truth = Truth(TIMES + ahead, ROTATION, PLACE)
+    with pytest.raises(ValueError, match="see --time-offset") as refused:
+        replayed(truth, time_offset=ahead - 600)
+    found = re.search(r"behind by about (\S+) s: see --time-offset \((\S+), or", str(refused.value))
+    assert found
+    assert found[2] == "-" + found[1]
+    assert float(found[2]) == pytest.approx(ahead - 1, abs=0.002)  # the truth starts 1 s earlier
+    _, result = replayed(truth, time_offset=float(found[2]) + 1)
+    assert result.figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
+    line = compared(result.figures)[1]
+    assert line == "the truth's clock is ahead by -1763550004.137 s (time_offset)"
+    (note,) = replayed(truth, time_offset=ahead - 0.4)[1].figures["notes"]
+    assert re.search(r"0\.(35|40|45) s ahead; see --time-offset -1763550004\.(09|14|19)", note), (
+        note
+    )
 
 
 @pytest.mark.parametrize("align", ["none", "se3"])

@@ -566,3 +566,11 @@ def test_an_anchor_that_is_missing_gives_a_warning(tmp_path):
     assert note.startswith("WARNING: ")
     assert "(E)" in note
     assert "add it to the table of anchors" in note
+
+
+def test_swapped_columns_of_anchors_and_tags_are_named(tmp_path):
+    text = LONG.replace("t,anchor,tag,range", "t,to,from,range")
+    with pytest.raises(ValueError, match='swapped: give --columns "anchor=to,tag=from"'):
+        read_as(tmp_path, text, columns={"anchor": "from", "tag": "to"})
+    with pytest.raises(ValueError, match="add it to the table of anchors"):
+        read_as(tmp_path, LONG.replace("A,", "E,"))

@@ -92,3 +92,9 @@ def test_one_table_in_another_unit_is_refused(ranges_in, anchors_in, tags_in, fi
     times, ranges, links = recording(ROOM, SOLID)
     with pytest.raises(ValueError, match=rf"{file}.csv: units look inconsistent"):
         check_units(PATHS, times, ranges_in * ranges, links, anchors_in * ROOM, tags_in * SOLID)
+
+
+def test_ranges_in_too_small_a_unit_are_named_beside_the_anchors():
+    times, ranges, links = recording(ROOM, SOLID)
+    with pytest.raises(ValueError, match=r"Or is the unit of the ranges in .*ranges.csv wrong"):
+        check_units(PATHS, times, 0.1 * ranges, links, ROOM, SOLID)

@@ -13,6 +13,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.geometry import bodies
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from rbl_gym.studies.replay.figures import wide_note
 from tests import recorded
 from tests.helpers import with_kernels
 from tests.recorded import ROOM, flight, swaying
@@ -61,6 +62,17 @@ def test_a_covariance_wider_than_the_errors_names_the_assumed_errors():
     replayed = replay.replay_recording(log._replace(truth=None), SMOOTH.changed(range_std_m=0.15))
     (note,) = [n for n in replayed.figures["notes"] if "smoothed track" in n]
     assert f"NIS {replayed.figures['smoothed']['nis']:.2f}" in note
+
+
+def test_a_small_nis_is_no_wide_covariance_if_the_errors_are_larger():
+    settings = SMOOTH.flat()
+    (wide,) = wide_note({"nis": 0.45, "anees": 0.3}, settings)
+    assert "too large" in wide
+    assert wide_note({"nis": 0.45, "anees": 1.0}, settings) == []
+    (narrow,) = wide_note({"nis": 0.45, "anees": 4.78}, settings)
+    assert "too small (NEES per degree of freedom 4.78" in narrow
+    assert "an anchor or a tag at a wrong position" in narrow
+    assert "too large" not in narrow
 
 
 @with_kernels

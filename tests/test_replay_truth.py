@@ -14,7 +14,7 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.frozen_truth import frozen_spells
-from rbl_gym.studies.replay.truth import check_overlap, matched, stamp_hints
+from rbl_gym.studies.replay.truth import Judged, check_overlap, fault_hints, matched, stamp_hints
 from tests.recorded import curve, flight, honest_track
 
 
@@ -330,6 +330,17 @@ def planar_note(change):
 def test_a_planar_offset_of_the_heading_is_hinted():
     note = planar_note(lambda R: R @ rotations.exp(np.array([0, 0, -0.2])))
     assert "body frame, turned by (0.0, 0.0, 11.5) deg" in note.replace("-0.0", "0.0")
+
+
+def test_no_order_of_quaternions_is_hinted_for_headings():
+    times, rotation, place = moving(0.05)
+    heading = rotations.exp(rotations.yaw(rotation)[:, None] * [0, 0, 1])
+    for truth, hinted in ((rotation, True), (heading, False)):
+        track = rotations.from_quaternion(np.roll(rotations.quaternion(truth), 1, axis=-1))
+        small = np.full(len(times), 1e-4)
+        judged = Judged(times, track, place, truth, place, small, small)
+        hints = fault_hints(lambda *_, judged=judged: judged, lambda R: R, False)
+        assert any("quaternion" in hint for hint in hints) == hinted, hints
 
 
 def test_another_order_of_quaternions_is_hinted_for_planar_bodies():

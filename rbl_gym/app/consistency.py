@@ -11,6 +11,7 @@ from rbl_gym.app.tables import new_table
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.replay import Replayed, nis_curve
 from rbl_gym.studies.replay.figures import gaps_of
+from rbl_gym.studies.replay.tuning import MOST_EPOCHS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,8 +45,9 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
 
 def tuned_text(found: dict[str, Any]) -> str:
     """Return the tuned values as command line options."""
+    most = " (the most that are used)" if found["epochs"] == MOST_EPOCHS else ""
     return (
-        f"tuned on {found['epochs']} epochs of the first {found['seconds']:.1f} s: "
+        f"tuned on {found['epochs']} epochs{most} of the first {found['seconds']:.1f} s: "
         f"{found['options']} (log-likelihood per range {found['log_likelihood']:.3f}, "
         f"{found['log_likelihood_before']:.3f} before tuning)"
     )

@@ -138,8 +138,8 @@ def _add_tuning(group: Any) -> None:
         "also chooses the filter; with --calibration it takes iekf-bias. The truth is not used",
     )
     _add_numbers(group, (
-        ("tune-s", "length of the first part of the log that --tune uses, seconds, default 20; "
-         "implies --tune"),
+        ("tune-s", "length of the first part of the log that --tune uses, seconds, default 20, "
+         "at most 3000 epochs; implies --tune"),
     ))  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from rbl_gym.app.consistency import print_consistency
 from rbl_gym.app.tables import new_console, new_table
+from rbl_gym.studies.replay.truth import seconds_text
 
 CAMSAP_COLUMNS = (
     ("rotation RMSE", "rotation_rmse", "{:.4f}"),
@@ -249,7 +250,7 @@ def compared(result: dict[str, Any]) -> list[str]:
             f"the motion of the {found['track']} track (correlation {found['correlation']:.2f})"
         )
     elif ahead := result["settings"].get("time_offset"):
-        parts.append(f"the truth's clock is ahead by {ahead:.10g} s (time_offset)")
+        parts.append(f"the truth's clock is ahead by {seconds_text(ahead)} s (time_offset)")
     if "alignment" in result:
         found = result["alignment"]
         parts.append(

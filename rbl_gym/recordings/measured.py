@@ -314,6 +314,8 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         causes = ", ".join(f"{n} {cause}" for cause, n in bad.items())
         worst = max(bad, key=lambda cause: bad[cause])
         hint = f"; {_HINTS[worst]}" if worst in _HINTS else ""
+        if "unknown" in worst:
+            hint = _swapped(table, ids) or hint
         raise ValueError(
             f"{table.path}: {count} of {total} ranges cannot be used ({causes}), more than the "
             f"fifth that is allowed. The first: {_first(measured, table, ids, refused)}{hint}"
@@ -326,6 +328,19 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         missing = {c: n for c, n in shown.items() if "unknown" in c and n > _MANY * total}
         hints = "".join(f"; {_HINTS[cause]}" for cause in missing if cause in _HINTS)
         said.note(table.path, text + hints, warn=bool(missing))
+
+
+def _swapped(table: Table, ids: Ids) -> str:
+    """Return a hint if the columns of anchors and tags have the ids of the other."""
+    columns = ("anchor", "tag")
+    if any(
+        column not in table.columns or (table.positions(column, known) < 0).mean() > _MOST_BAD
+        for column, known in zip(columns, ids[::-1], strict=True)
+    ):
+        return ""
+    anchor, tag = (table.name(column) for column in columns)
+    told = table.source.given(anchor=tag, tag=anchor)
+    return f'; the columns of anchors and tags look swapped: give --columns "{told}"'
 
 
 def _in_file(table: Table, column: str) -> str:

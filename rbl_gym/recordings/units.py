@@ -120,7 +120,8 @@ def _check_pairs(
             raise ValueError(
                 f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart, "
                 f"but the ranges to two of them have a sum of only {np.median(total):.4g} m: are "
-                f"the positions of the {name} in cm or mm?{_remedy(paths, name)}"
+                f"the positions of the {name} in cm or mm?{_remedy(paths, name)} "
+                f"Or is the unit of the ranges in {paths[0]} wrong (--unit)?"
             )
     some = slice(None, None, 1 + len(ranges) // _EPOCHS)
     ranges, links = ranges[some], links[some]

@@ -27,6 +27,7 @@ from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_
 from rbl_gym.studies.calibrate.outliers import few, outliers
 from rbl_gym.studies.calibrate.settings import LinkSettings
 from rbl_gym.studies.frozen_truth import frozen_notes
+from rbl_gym.studies.replay.truth import rough_offset, seconds_text
 
 __all__ = ["CalibratedLinks", "calibrate_links"]
 
@@ -137,7 +138,7 @@ def calibrate_links(
     if not links.any():
         raise ValueError(
             f"no range has truth within {settings.truth_gap_s:g} s: {_spans(log.runs[0])}; see "
-            "time_offset, truth_gap_s and truth_exclude"
+            "time_offset, truth_gap_s and truth_exclude" + _clock_hint(log.runs[0], start)
         )
     biases = settings.biases
     if biases == "auto":
@@ -205,8 +206,25 @@ def _check_fit(fit: LinkFit) -> None:
 def _spans(run: Recording) -> str:
     """Return the times of the ranges and of the truth of a run, as text."""
     assert run.truth is not None
-    spans = [f"{times[0]:.10g} to {times[-1]:.10g} s" for times in (run.times, run.truth.times)]
+    spans = [
+        f"{seconds_text(times[0])} to {seconds_text(times[-1])} s"
+        for times in (run.times, run.truth.times)
+    ]
     return f"ranges {spans[0]}, truth {spans[1]}"
+
+
+def _clock_hint(run: Recording, told_s: float) -> str:
+    """Return a hint if ranges and truth look like those of one run with two clocks."""
+    assert run.truth is not None
+    offset = rough_offset(run.times + told_s, run.truth)
+    if not offset:
+        return ""
+    total = offset + told_s
+    side = "ahead" if total > 0 else "behind"
+    return (
+        f"; the truth's clock may be {side} by about {seconds_text(abs(total))} s, and auto "
+        "searches only up to 1 s: find the offset by rbl-gym replay --time-offset auto, and give it"
+    )
 
 
 def _with_clock(

@@ -13,6 +13,7 @@ from rbl_gym.studies.misplaced import ANCHOR_M, LEFT, MOST_OFF_M, Misplaced, mis
 from rbl_gym.studies.replay.causes import local_trial
 from rbl_gym.studies.replay.evidence import Trial, evidence
 from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.suppositions import likely_height
 from rbl_gym.studies.replay.tracking import Track
 
 # An anchor is examined if its bias is above this (m), or if a move of it leaves less than this
@@ -33,7 +34,8 @@ def anchor_note(recording: Recording, settings: Settings, track: Track) -> list[
     is strange if its bias is large for a radio, or if its ranges fit the track better after a move.
     A strange anchor is moved to where it fits a track by the other anchors. The warning names the
     anchor whose move makes the ranges most likely. It names a bias if no move does, but the bias is
-    `MOST_OFF_M` above that of the other anchors.
+    `MOST_OFF_M` above that of the other anchors. If another height of a planar body makes the
+    ranges more likely than any move, the warning names the height.
     """
     offset = _relative_biases(recording, track)
     if offset is None or recording.offset is not None or recording.inertial is not None:
@@ -47,7 +49,14 @@ def anchor_note(recording: Recording, settings: Settings, track: Track) -> list[
     ]
     if not strange:
         return []
-    moves, gains = _moves(_some(recording, settings), strange, planar)
+    trial = _some(recording, settings)
+    moves, gains = _moves(trial, strange, planar)
+    if planar:
+        # At a wrong height the ranges of low and high anchors err in opposite directions.
+        least = max(_GAIN, float(gains.max()))
+        height, gain = likely_height(trial, least)
+        if gain > least:
+            return [f"WARNING: {height.text}. The filter's biases hide the error."]
     # The bias of a filter is of the whole log, and the surest sign.
     largest = max(strange, key=lambda m: abs(offset[m]))
     best = int(np.argmax(gains))

@@ -12,6 +12,7 @@ from rbl_gym.recordings import apply_alignment
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.frozen_truth import frozen_notes
 from rbl_gym.studies.replay.centre import is_line
+from rbl_gym.studies.replay.diagnosis import WIDE
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
     as_judged,
@@ -44,6 +45,8 @@ _GAP_S, _GAP_STEPS = 1.0, 5.0
 _WHILE_S = 1.0
 # A smoothed track with a NIS or a NEES per degree of freedom below these has a large covariance.
 _WIDE_NIS, _WIDE_NEES = 0.5, 0.4
+# Above this NEES per degree of freedom its covariance is too small, whatever its NIS.
+_NARROW_NEES = 1.5
 # Number of epochs that is sufficient to find a fault of the truth.
 _ENOUGH = 1000
 
@@ -87,10 +90,22 @@ def smoothed_figures(smoothed: SmoothedRecording, found: TrackErrors | None) -> 
 
 
 def wide_note(smoothed: dict[str, Any], settings: dict[str, Any]) -> list[str]:
-    """Return a note if the smoothed covariance is clearly larger than the errors of the log."""
+    """Return a note if the smoothed covariance is clearly larger than the errors of the log.
+
+    If its NIS says so but its NEES says the opposite, the note is on the error that biases absorb.
+    """
     nis, nees = smoothed["nis"], smoothed.get("anees", 1.0)
     if nis > _WIDE_NIS and nees > _WIDE_NEES:
         return []
+    if "anees" in smoothed and WIDE < nees <= _NARROW_NEES:
+        return []
+    if nees > _NARROW_NEES:
+        return [
+            f"Note: the covariance of the smoothed track is too small (NEES per degree of freedom "
+            f"{nees:.2f}, 1: consistent), although its NIS is small ({nis:.2f}): the estimated "
+            "biases absorb an error that is not noise. Likely: an anchor or a tag at a wrong "
+            "position, or an error of the truth. rbl-gym calibrate with the truth looks for it."
+        ]
     of, names = "smooth", ("smooth_constant_m", "smooth_common_m", "smooth_bias_std_m")
     if settings["filter"] == "iekf-imu":
         of, names = "constant", ("constant_std_m", "constant_common_m", "drift_std_m")
@@ -338,7 +353,8 @@ def _fault_hints(
     def seen(rotation: FloatArray) -> FloatArray:
         return reference.alignment.rotation @ as_judged(rotation, settings, reference.planar)
 
-    return fault_hints(at, seen, reference.planar)
+    told_s = float(settings.comparison.time_offset)
+    return fault_hints(at, seen, reference.planar, told_s)
 
 
 def _stride(times: FloatArray, gap_s: float) -> int:

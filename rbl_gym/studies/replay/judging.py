@@ -158,7 +158,7 @@ def truth_of(recording: Recording, track: Track, settings: Settings) -> Referenc
     if settings.comparison.time_offset == "auto":
         settings = with_offset(settings, find_offset(recording, track, settings))
     truth, gap_s = in_clock(recording.truth, settings), settings.comparison.truth_gap_s
-    check_overlap(truth, track.times, gap_s)
+    check_overlap(truth, track.times, gap_s, float(settings.comparison.time_offset))
     rotation, translation, known = matched(truth, *track[:3], gap_s)
     planar = _is_planar(truth, settings)
     out = known & excluded_epochs(track.times, settings)

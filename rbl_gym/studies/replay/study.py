@@ -73,7 +73,8 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
     comparison = settings.comparison
     if recording.truth is not None and comparison.time_offset != "auto":
         truth = in_clock(recording.truth, settings)
-        check_overlap(truth, recording.times, comparison.truth_gap_s)
+        told_s = float(comparison.time_offset)
+        check_overlap(truth, recording.times, comparison.truth_gap_s, told_s)
     return settings
 
 
@@ -115,15 +116,15 @@ def replay_recording(
         lags = smoothed is None
         figures["time_offset"] = {**offset._asdict(), "track": "causal" if lags else "smoothed"}
     figures["consistency"], notes = diagnose(recording, settings, track)
-    if figures.get("anees", 0.0) > WIDE:
+    smoothed_errors = None
+    if smoothed is not None:
+        smoothed_errors = track_errors(recording, smoothed.track, settings)
+        figures["smoothed"] = smoothed_figures(smoothed, smoothed_errors)
+        notes += wide_note(figures["smoothed"], figures["settings"])
+    if max(each.get("anees", 0.0) for each in (figures, figures.get("smoothed", {}))) > WIDE:
         # The errors are as large as the covariance says: it is not too large.
         notes = [note for note in notes if not note.startswith(WIDE_NOTE)]
     figures["notes"] = figures["notes"] + ([] if offset is None else _offset_note(offset)) + notes
-    if smoothed is None:
-        return Replayed(settings, track, errors, figures)
-    smoothed_errors = track_errors(recording, smoothed.track, settings)
-    figures["smoothed"] = smoothed_figures(smoothed, smoothed_errors)
-    figures["notes"] += wide_note(figures["smoothed"], figures["settings"])
     return Replayed(settings, track, errors, figures, smoothed, smoothed_errors)
 
 

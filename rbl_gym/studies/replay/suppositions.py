@@ -12,7 +12,7 @@ import scipy
 from rbl_gym.checks import FloatArray
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.replay.evidence import Evidence, Trial, std_of
+from rbl_gym.studies.replay.evidence import Evidence, Trial, evidence, std_of
 from rbl_gym.studies.replay.place import own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M
 from rbl_gym.studies.replay.tracking import accel_of, recording_filter, robust_of
@@ -79,6 +79,26 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
     if settings.knowledge.planar:
         for step in _HEIGHTS_M:
             yield _height(trial, step)
+
+
+def likely_height(trial: Trial, least: float) -> tuple[Supposition, float]:
+    """Return the most likely other height of a planar body, and the log-likelihood it gains.
+
+    The search ends early if no tested height gains more than `least`.
+    """
+    steps = list(_HEIGHTS_M)
+    gains = _gains(trial, steps)
+    if max(gains) > least:
+        finer = _about([*steps, 0.0], [*gains, 0.0]).tolist()
+        steps, gains = steps + finer, gains + _gains(trial, finer)
+    best = int(np.argmax(gains))
+    return _height(trial, steps[best]), gains[best]
+
+
+def _gains(trial: Trial, steps: list[float]) -> list[float]:
+    trials = [trial, *(_height(trial, step).trial for step in steps)]
+    likelihood = evidence(trials).log_likelihood.sum(axis=1)
+    return np.nan_to_num(likelihood[1:] - likelihood[0], nan=-np.inf).tolist()
 
 
 def left_out(trial: Trial) -> list[Trial]:

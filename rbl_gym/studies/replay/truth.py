@@ -73,25 +73,25 @@ def matched(
     return turned, moved, known
 
 
-def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
-    """Raise ValueError with the gap if no epoch would have truth."""
+def check_overlap(truth: Truth, times: FloatArray, gap_s: float, told_s: float = 0.0) -> None:
+    """Raise ValueError with the gap if no epoch would have truth.
+
+    `told_s` is the time offset by which the truth has been corrected.
+    """
     still = np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros((len(times), 3))
     if matched(truth, times, *still, gap_s)[2].any():
         return
-    spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (times, truth.times)]
+    spans = [f"{seconds_text(t[0])} to {seconds_text(t[-1])} s" for t in (times, truth.times)]
     where = f"ranges {spans[0]}, truth {spans[1]}"
     apart = max(truth.times[0] - times[-1], times[0] - truth.times[-1])
     hints = "".join(f"; {hint}" for hint in stamp_hints(times, truth))
     if apart > 0:
-        shift = truth.times[0] - times[0]
-        longest = max(np.ptp(times), np.ptp(truth.times))
-        if not hints and abs(np.ptp(times) - np.ptp(truth.times)) < 0.2 * longest < 0.2 * abs(
-            shift
-        ):
-            side = "ahead" if shift > 0 else "behind"
+        if not hints and (offset := rough_offset(times, truth)):
+            total = offset + told_s
+            side = "ahead" if total > 0 else "behind"
             hints = (
-                f"; the truth's clock may be {side} by about {abs(shift):.10g} s: "
-                f"see --time-offset ({shift:.10g}, or auto)"
+                f"; the truth's clock may be {side} by about {seconds_text(abs(total))} s: see "
+                f"--time-offset ({seconds_text(total)}, or auto)"
             )
         raise ValueError(
             f"no epoch has truth, as the truth does not overlap with the ranges in time: {where}, "
@@ -102,6 +102,22 @@ def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
         f"no epoch has truth, as gaps above {gap_s:g} s are not bridged; the shortest gaps are "
         f"{gaps[0]} in the truth and {gaps[1]} in the ranges ({where}); see --truth-gap-s{hints}"
     )
+
+
+def rough_offset(times: FloatArray, truth: Truth) -> float:
+    """Return by how much the truth starts later, if both are of about one run; 0: they are not."""
+    shift = float(truth.times[0] - times[0])
+    longest = max(np.ptp(times), np.ptp(truth.times))
+    same = abs(np.ptp(times) - np.ptp(truth.times)) < 0.2 * longest < 0.2 * abs(shift)
+    return shift if same else 0.0
+
+
+def seconds_text(seconds: float) -> str:
+    """Return seconds with their milliseconds, without zeros at the end.
+
+    Stamps since 1970 have ten digits before the point.
+    """
+    return f"{seconds:.3f}".rstrip("0").rstrip(".")
 
 
 def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
@@ -162,8 +178,9 @@ class Judged(NamedTuple):
 
 
 def fault_hints(
-    at: Callable[[float, bool], Judged], seen: Callable[[FloatArray], FloatArray], planar: bool
-) -> list[str]:
+    at: Callable[[float, bool], Judged], seen: Callable[[FloatArray], FloatArray], planar: bool,
+    told_s: float = 0.0,
+) -> list[str]:  # fmt: skip
     """Return at most two constant faults of the truth that explain most of the errors.
 
     Tested are the order and the direction of the quaternions, the unit of the positions, a time
@@ -172,7 +189,8 @@ def fault_hints(
     ``at(delay, rotations)`` returns the compared poses at some epochs: `delay`, in seconds,
     corrects the time stamps of the truth; with `rotations` the result has those of the file,
     otherwise none. `seen` converts rotations (L, 3, 3) of the file to those that are compared; if
-    `planar`, the position has only x and y.
+    `planar`, the position has only x and y. `told_s` is the time offset by which the truth has been
+    corrected.
     """
 
     def mended(judged: Judged) -> Judged:
@@ -184,7 +202,7 @@ def fault_hints(
     if len(as_read.times) < _FEWEST:
         return []
     judged = mended(as_read)
-    late = [(text, mended(other)) for text, other in _late(at)]
+    late = [(text, mended(other)) for text, other in _late(at, told_s)]
     # Cautious beliefs hide a shift that explains most of the position errors.
     shifts = [
         f"{text}: the errors would be {other.rmse()} instead of {judged.rmse()}"
@@ -234,10 +252,10 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
     """Yield quaternions in another order, inverted rotations, positions in another unit."""
     Q = judged.true_rotation
     q = rotations.quaternion(Q)
-    for text, other in (
-        ()
-        if not judged.has_rotation
-        else (
+    turned: list[tuple[str, FloatArray]] = []
+    # Rotations about z alone are headings, or quaternions in the right order.
+    if judged.has_rotation and (np.abs(q[..., 1:3]) > 1e-6).any():
+        turned += [
             (
                 "the truth's quaternions look like x, y, z, w in columns named w, x, y, z",
                 rotations.from_quaternion(q[..., [3, 0, 1, 2]]),
@@ -246,12 +264,15 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
                 "the truth's quaternions look like w, x, y, z in columns named x, y, z, w",
                 rotations.from_quaternion(q[..., [1, 2, 3, 0]]),
             ),
+        ]
+    if judged.has_rotation:
+        turned.append(
             (
                 "the truth's rotations look inverted (from the world to the body)",
                 np.swapaxes(Q, 1, 2),
-            ),
+            )
         )
-    ):
+    for text, other in turned:
         yield text, judged._replace(true_rotation=other)
     spread = [np.ptp(a, axis=0).max() for a in (judged.translation, judged.true_translation)]
     for scale, unit in ((0.01, "centimetres"), (0.001, "millimetres")):
@@ -262,7 +283,7 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
         yield f"the truth's positions look like {unit}", judged._replace(true_translation=moved)
 
 
-def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
+def _late(at: Callable[[float, bool], Judged], told_s: float) -> Iterator[tuple[str, Judged]]:
     """Yield the time shift with the smallest position errors, if it is not about zero."""
 
     def left(shift: float) -> float:
@@ -276,7 +297,8 @@ def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
     if abs(best) > 0.01:
         side = "ahead" if best > 0 else "behind (or the filter lags: see --walk-m)"
         yield (
-            f"the truth's clock looks about {abs(best):.2f} s {side}; see --time-offset {best:.2f}",
+            f"the truth's clock looks about {abs(best):.2f} s {side}; see --time-offset "
+            f"{best + told_s:.2f}",
             at(best, True),
         )
 

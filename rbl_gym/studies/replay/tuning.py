@@ -33,7 +33,7 @@ _LIMITS = {
 _FACTORS = (4.0, 3.0, 2.0, 1.5, 1.25, 1.15)
 TUNING_ROUNDS = len(_FACTORS)
 # Longest part that is used, in epochs.
-_MOST = 3_000
+MOST_EPOCHS = 3_000
 
 
 class Tuned(NamedTuple):
@@ -88,7 +88,7 @@ def tune(
     recording, settings
         The recording and the settings, from which the search starts.
     seconds
-        Length of the part of the log, from its start, that is used.
+        Length of the part of the log, from its start, that is used; at most 3,000 epochs of it.
     filters
         Names of filters, of which the one with the highest likelihood is chosen; empty: that of
         the settings.
@@ -101,7 +101,8 @@ def tune(
         If `seconds` is not positive, or the part has fewer than ten epochs.
     """
     seconds = check_number("seconds", seconds, low=1e-6)
-    count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
+    count = int(np.searchsorted(recording.times, recording.times[0] + seconds, "right"))
+    count = min(count, MOST_EPOCHS)
     if count < 10:
         raise ValueError(
             f"the first {seconds:g} s must have at least 10 epochs for tuning, got {count}: use a "
