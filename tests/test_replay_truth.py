@@ -14,7 +14,8 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.frozen_truth import frozen_spells
-from rbl_gym.studies.replay.truth import Judged, check_overlap, fault_hints, matched, stamp_hints
+from rbl_gym.studies.replay.overlap import check_overlap, stamp_hints
+from rbl_gym.studies.replay.truth import Judged, fault_hints, matched
 from tests.recorded import curve, flight, honest_track
 
 

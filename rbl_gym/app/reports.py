@@ -7,7 +7,7 @@ from typing import Any
 
 from rbl_gym.app.consistency import print_consistency
 from rbl_gym.app.tables import new_console, new_table
-from rbl_gym.studies.replay.truth import seconds_text
+from rbl_gym.studies.replay.overlap import seconds_text
 
 CAMSAP_COLUMNS = (
     ("rotation RMSE", "rotation_rmse", "{:.4f}"),

@@ -314,8 +314,7 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         causes = ", ".join(f"{n} {cause}" for cause, n in bad.items())
         worst = max(bad, key=lambda cause: bad[cause])
         hint = f"; {_HINTS[worst]}" if worst in _HINTS else ""
-        if "unknown" in worst:
-            hint = _swapped(table, ids) or hint
+        hint = _swapped(table, ids) or hint
         raise ValueError(
             f"{table.path}: {count} of {total} ranges cannot be used ({causes}), more than the "
             f"fifth that is allowed. The first: {_first(measured, table, ids, refused)}{hint}"
@@ -350,8 +349,7 @@ def _in_file(table: Table, column: str) -> str:
 
 def _unknown_ids(measured: Measured, table: Table, cause: str) -> str:
     """Return the unknown anchors or tags in brackets; nothing for other causes."""
-    column = _CAUSES[cause][1]
-    column = _in_file(table, column)
+    column = _in_file(table, _CAUSES[cause][1])
     if "unknown" not in cause or column not in table.columns:
         return ""
     rows = measured.row[measured.cause == _NAMES.index(cause)]

@@ -27,7 +27,7 @@ from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_
 from rbl_gym.studies.calibrate.outliers import few, outliers
 from rbl_gym.studies.calibrate.settings import LinkSettings
 from rbl_gym.studies.frozen_truth import frozen_notes
-from rbl_gym.studies.replay.truth import rough_offset, seconds_text
+from rbl_gym.studies.replay.overlap import rough_offset, seconds_text
 
 __all__ = ["CalibratedLinks", "calibrate_links"]
 

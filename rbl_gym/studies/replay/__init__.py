@@ -14,6 +14,7 @@ from rbl_gym.studies.replay.judging import (
     truth_path,
 )
 from rbl_gym.studies.replay.mirror import Mirror, covering, other_pose
+from rbl_gym.studies.replay.overlap import check_overlap
 from rbl_gym.studies.replay.place import height_offset, origin_of, volume_of
 from rbl_gym.studies.replay.runs import ReplayedRuns, replay_runs
 from rbl_gym.studies.replay.sensors import Inertial, Odometry
@@ -38,7 +39,6 @@ from rbl_gym.studies.replay.tracking import (
     recording_steps,
     track_recording,
 )
-from rbl_gym.studies.replay.truth import check_overlap
 from rbl_gym.studies.replay.tuning import TUNING_ROUNDS, Tuned, tune
 
 __all__ = [

@@ -22,6 +22,7 @@ from rbl_gym.studies.replay.judging import (
 )
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
 from rbl_gym.studies.replay.observed import known_figures
+from rbl_gym.studies.replay.overlap import stamp_hints
 from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.smoothing import SmoothedRecording
@@ -32,7 +33,6 @@ from rbl_gym.studies.replay.truth import (
     fault_hints,
     judged_of,
     matched,
-    stamp_hints,
 )
 
 __all__ = ["track_figures"]

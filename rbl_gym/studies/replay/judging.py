@@ -15,9 +15,10 @@ from rbl_gym.recordings.align import Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.recordings.truth import Truth
 from rbl_gym.studies.replay.centre import is_line
+from rbl_gym.studies.replay.overlap import check_overlap
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track
-from rbl_gym.studies.replay.truth import check_overlap, matched
+from rbl_gym.studies.replay.truth import matched
 
 __all__ = ["Reference", "TrackErrors", "find_offset", "track_errors", "truth_of", "truth_path"]
 

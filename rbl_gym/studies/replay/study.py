@@ -19,11 +19,11 @@ from rbl_gym.studies.replay.judging import (
     track_errors,
     with_offset,
 )
+from rbl_gym.studies.replay.overlap import check_overlap
 from rbl_gym.studies.replay.place import height_offset
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.smoothing import SmoothedRecording, smooth_recording
 from rbl_gym.studies.replay.tracking import Track, recording_filter, robust_of, track_recording
-from rbl_gym.studies.replay.truth import check_overlap
 
 __all__ = ["Replayed", "check_replay", "replay_recording"]
 
