@@ -275,8 +275,8 @@ def test_given_anchors_in_a_wall_or_just_off_a_mount_are_named():
     box, wall, off, free = given_notes(problem, np.array(anchors, float), names)
     assert wall.startswith("Anchor 'in' is inside a wall or an obstacle: x -0.10 to 0.10 m, y 0.00")
     assert box.startswith("Anchor 'box' is inside a wall or an obstacle: x 9.00 to 10.00 m")
-    assert "'off' 0.05 m from 'west', where it would be at (0.100, 4.000, 2.000)." in off
-    assert off.count("where") == 1
+    assert "'off' is 0.05 m from 'west' (nearest point of the mount: (0.100, 4.000, 2.000))." in off
+    assert off.count("nearest") == 1
     assert free.startswith("Anchor 'free' at (6.000, 4.000, 1.000) is on no mount")
     placed = place_anchors(
         problem, Question(range(4, 5), layout=np.array(anchors[:4]), trials=4, survive=0)

@@ -424,7 +424,8 @@ def test_heights_and_names_of_a_wall_that_also_carries_mounts():
     assert [(one["name"], one["low_m"], one["high_m"]) for one in tables["mounts"]] == [
         ("north", 3.0, 4.8), ("gate", 4.0, 4.8), ("7", 3.0, 4.2),
     ]  # fmt: skip
-    assert "layer W, read as mounts: 1 walls end below the mounts, and carry none" in made.said
+    short = "1 walls end below the lowest height of the mounts, and have no mount"
+    assert f"layer W, read as mounts: {short}" in made.said
 
 
 def test_mounts_of_one_name_are_numbered():

@@ -123,9 +123,9 @@ def usual_notes(result: dict[str, Any]) -> list[str]:
         return []
     where = " and ".join(f"layouts.{name}.anchors_m" for name in dict.fromkeys(names))
     return [
-        f"{' '.join(found)} The search reduces the shortfall of all zones together first, and "
-        f"the mean error b only after that. The positions are in the file of --json, {where}: "
-        "to use them, write them to a CSV file with the columns x_m,y_m,z_m for --layout."
+        f"{' '.join(found)} The search first reduces what all zones together lack of their "
+        "requirements, and only then the mean error b. The positions are in the file of --json, "
+        f"{where}: to use them, write them to a CSV file with the columns x_m,y_m,z_m for --layout."
     ]
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _HELP = {
-    "walls": "lines that weaken links: name, material, as in material=concrete, thickness_m, "
+    "walls": "lines that weaken links: name, material (as in material=concrete), thickness_m, "
     "side_by_side_m (largest distance of two lines that are one wall)",
     "obstacles": "areas that weaken links and where the body cannot be: name, material, low_m, "
     "high_m",

@@ -349,7 +349,12 @@ FORMAT: dict[str, Table] = {
                     "shape": Key(
                         "choice", "arrangement of the tags", needed=True, choices=tuple(BODIES)
                     ),
-                    "size_m": Key("any", "its size, metres", default=1.0),
+                    "size_m": Key(
+                        "any",
+                        "its size, metres: distance between opposite tags of an octahedron, edge "
+                        "of a cube, side of a plate, base and height of a pyramid",
+                        default=1.0,
+                    ),
                 }
             ),
         ),

@@ -46,7 +46,7 @@ def read_directions(
     table.check((end == "anchor") | (end == "tag"), "end", "must be anchor or tag")
     at_tag = end == "tag"
     at = np.where(at_tag, table.positions("id", ids[1]), table.positions("id", ids[0]))
-    table.check(at >= 0, "id", "must be the id of an anchor or a tag, as end says")
+    table.check(at >= 0, "id", "must be the id of an anchor if end is anchor, else of a tag")
     number = table.numbers("harmonic")
     whole = (number == np.round(number)) & (number >= 1) & (number <= _MOST)
     table.check(whole, "harmonic", f"must be 1, 2, ... {_MOST}")

@@ -181,7 +181,7 @@ def check_state(state: Any, batch: tuple[int, ...]) -> None:
         and hasattr(state, "_fields")
         and all(np.shape(field)[: len(batch)] == batch for field in state),
         "a state must be a NamedTuple of arrays whose leading axes are those of the prior, got "
-        f"{type(state).__name__}: commands and vector environments take it apart",
+        f"{type(state).__name__}: commands and vector environments index its arrays",
     )
 
 

@@ -250,7 +250,7 @@ class _Maker:
                 rows.append({"kind": own, "polygon": points_of(ring), **values})
         return _commented(rows, layer), [
             (len(left), "shapes that are not closed were left out"),
-            (len(short), "walls end below the mounts, and carry none"),
+            (len(short), "walls end below the lowest height of the mounts, and have no mount"),
         ]
 
     def _fixed(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:

@@ -12,9 +12,9 @@ _WIDTH = 96
 # Remarks on tables, by the name of the table.
 _REMARKS = {
     "anchors": "number of anchors to place, `fixed` ones included",
-    "zones": "where the body works; attitude: free, level or heading (turned about the vertical "
-    "only); keys of requirements, for example: position_m = 0.10, height_m = 0.20, "
-    "heading_deg = 5.0, share = 0.95",
+    "zones": "where the body works; attitude: free, level (upright, the tilt is estimated) or "
+    "heading (the tilt is known); keys of requirements, for example: position_m = 0.10, "
+    "height_m = 0.20, heading_deg = 5.0, share = 0.95",
     "mounts": "where anchors may be mounted: wall, ceiling, column, area or points",
     "forbidden": "no anchors here",
     "walls": "each crossing leaves the share of a link's information that [materials] gives",
@@ -23,8 +23,8 @@ _REMARKS = {
     "rough values, enter your own; drywall, glass, wood, brick, concrete and metal are known "
     "without an entry",
     "plan": "the drawing from which this was read; layouts are exported to its coordinates",
-    "body": "the tags on the body, assumed: enter yours, a shape and size_m, or only tags = "
-    "[[x, y, z], ...] in metres",
+    "body": "the tags on the body, assumed: enter yours, either shape and size_m, or in place of "
+    "both tags = [[x, y, z], ...], metres",
     "noise": "standard deviation of a range, assumed: enter that of your radio",
 }
 

@@ -67,13 +67,13 @@ def _off_mounts(
     found = []
     if len(near):
         told = [
-            f"{names[k]!r} {away[k]:.2f} m from {there[k]!r}, where it would be at "
-            f"{_point(legal[k])}"
+            f"{names[k]!r} is {away[k]:.2f} m from {there[k]!r} (nearest point of the mount: "
+            f"{_point(legal[k])})"
             for k in near
         ]
         found.append(
-            "Near a mount but not on it, so that they can see in all directions: "
-            f"{'; '.join(told)}."
+            "Anchors that are near a mount but not on it count as free: they see in all "
+            f"directions. {'; '.join(told)}."
         )
     if len(far):
         told = [
