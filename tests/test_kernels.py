@@ -181,6 +181,10 @@ print(kernel.scaled.build()(1.0))
         (package / "helper.py").write_text(_HELPER.format(value))
         assert run_python(code) == [str(value)]
         saved.add(tuple(sorted((f.name, f.stat().st_mtime_ns) for f in package.rglob("*.nb?"))))
+    # A process that was stopped while it compiled leaves one of two files.
+    for file in (package / "__pycache__").glob("guf-*"):
+        file.unlink()
+    assert run_python(code) == ["3.0"]
     # Compiled twice, the third time loaded; nothing stale is left behind.
     assert len(saved) == 2
     assert len({len(files) for files in saved}) == 1

@@ -171,6 +171,15 @@ def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any,
     return made.build_ufunc()
 
 
+def _forget(function: Callable[..., Any]) -> bool:
+    """Delete the files of a kernel; return whether there were any."""
+    name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}-"
+    files = [] if _CACHE is None else [*_CACHE.glob(f"*{name}*.nb?")]
+    for file in files:
+        file.unlink(missing_ok=True)
+    return bool(files)
+
+
 def _lock_file() -> contextlib.AbstractContextManager[IO[str] | None]:
     if _CACHE is None or fcntl is None:
         return contextlib.nullcontext()
@@ -219,7 +228,14 @@ def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
                 kind = _TYPES[letter]
                 arguments.append(kind[(slice(None),) * rank] if rank else kind)
             with _alone(), _in_haste(), types_remembered(), _loading_alone():
-                made = _compile(function, signature, tuple(arguments))
+                try:
+                    made = _compile(function, signature, tuple(arguments))
+                except Exception:
+                    # A process that ended between the two steps leaves the files of the first one
+                    # only, with which numba cannot compile the second.
+                    if not _forget(function):
+                        raise
+                    made = _compile(function, signature, tuple(arguments))
             # The wrapper of numba around NumPy's ufunc takes a microsecond per call.
             return getattr(made, "ufunc", made)
 
