@@ -100,8 +100,7 @@ def notes(result: dict[str, Any]) -> list[str]:
     found.append(
         "Mounting list: z is above the floor of the building, z = 0; above slab: above the top of "
         "the slab that is named. Left and right are as you face the wall; other distances are at "
-        "right angles to the wall. The point to which a distance is measured can be seen "
-        "from the anchor."
+        "right angles to the wall. All distances are to points that the anchor sees."
     )
     for name, figures in check["filters"].items():
         if 1 - figures["found"] > _MANY_LOST:

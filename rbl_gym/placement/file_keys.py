@@ -81,9 +81,7 @@ def _size(doc: str, **more: Any) -> Key:
 
 _NEEDED: dict[str, Any] = {"needed": True}
 _POLYGON = Key(
-    "polygon",
-    "corners [[x, y], ...] in the plan, metres, clockwise or counter-clockwise",
-    **_NEEDED,
+    "polygon", "corners [[x, y], ...] in the plan, metres, in either direction", **_NEEDED
 )
 _LINE = Key("line", "points [[x, y], ...] in the plan, metres", **_NEEDED)
 _CLOSED = Key("flag", "whether the last point is joined to the first", default=False)
@@ -351,8 +349,7 @@ FORMAT: dict[str, Table] = {
                     ),
                     "size_m": Key(
                         "any",
-                        "its size, metres: distance between opposite tags of an octahedron, edge "
-                        "of a cube, side of a plate, base and height of a pyramid",
+                        "its size, metres: edge, side, or distance of opposite tags",
                         default=1.0,
                     ),
                 }
