@@ -349,7 +349,7 @@ FORMAT: dict[str, Table] = {
                     ),
                     "size_m": Key(
                         "any",
-                        "its size, metres: edge, side, or distance of opposite tags",
+                        "size, metres: edge or distance of opposite tags",
                         default=1.0,
                     ),
                 }
