@@ -348,9 +348,7 @@ FORMAT: dict[str, Table] = {
                         "choice", "arrangement of the tags", needed=True, choices=tuple(BODIES)
                     ),
                     "size_m": Key(
-                        "any",
-                        "size, metres: edge or distance of opposite tags",
-                        default=1.0,
+                        "any", "size, metres: edge or distance of opposite tags", default=1.0
                     ),
                 }
             ),
