@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.recordings.recording import Recording
@@ -19,8 +18,8 @@ _SHORTEST_S = 0.2
 _PARTS, _FEWEST = 8, 4
 # The body moves if the medians of the parts of most links change by more than this (m), as ranges
 # of a body at rest drift by 0.02 m; and if the probability that noise changes them as much is below
-# a limit.
-_CHANGE_M, _CHANCE = 0.05, 1e-6
+# 1e-6, the probability beyond so many standard deviations.
+_CHANGE_M, _DEVIATIONS = 0.05, 4.753
 # Variance of a median relative to that of a mean.
 _OF_MEDIAN = 0.5 * np.pi
 
@@ -92,7 +91,10 @@ def _moves(ranges: FloatArray, links: BoolArray, inside: slice, noise_m: float) 
         changes.append(np.ptp(middle))
     if not changes or np.median(changes) < _CHANGE_M:
         return False
-    return squares > scipy.special.chdtri(freedom, _CHANCE) * _OF_MEDIAN * noise_m**2
+    # The quantile of chi-square by Wilson and Hilferty: scipy.special takes long to import.
+    spread = 2 / (9 * freedom)
+    quantile = freedom * (1 - spread + _DEVIATIONS * math.sqrt(spread)) ** 3
+    return squares > quantile * _OF_MEDIAN * noise_m**2
 
 
 def frozen_notes(
