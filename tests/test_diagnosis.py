@@ -212,6 +212,7 @@ def test_honest_logs_are_not_doubted():
     assert sum(doubted) == 0
 
 
+@with_kernels
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_an_anchor_that_the_biases_of_the_filter_absorb_is_named(seed):
     """0.5 m away in any horizontal direction. The innovations look sound."""
@@ -330,6 +331,7 @@ def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     assert "20.0" in out
 
 
+@with_kernels
 def test_a_wrong_height_that_the_biases_of_the_filter_absorb_is_named():
     """A planar body, 0.5 m lower than told: no anchor is blamed, and a right height passes."""
     rng = np.random.default_rng(4)

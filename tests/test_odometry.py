@@ -278,6 +278,7 @@ SETTINGS = replay.Settings.of(
 START = (4.0, 3.5, 0.0, 143.0)
 
 
+@with_kernels
 def test_odometry_finds_the_heading_of_one_tag_and_halves_the_error():
     log = a_log()
     errors: dict[str, Any] = {

@@ -17,6 +17,7 @@ from rbl_gym.studies import replay
 from rbl_gym.studies.frozen_truth import frozen_spells
 from rbl_gym.studies.replay.overlap import check_overlap, stamp_hints
 from rbl_gym.studies.replay.truth import Judged, fault_hints, matched
+from tests.helpers import with_kernels
 from tests.recorded import curve, flight, honest_track
 
 
@@ -239,6 +240,7 @@ def floor_run(count, swapped, late_s=0.3):
     return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, told)
 
 
+@with_kernels
 @pytest.mark.parametrize("count", [1, 2])
 def test_swapped_axes_of_the_anchors_are_hinted_on_a_floor(count):
     """The ranges fit the mirrored layout, and an aligned frame has no heading of its own."""
