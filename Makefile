@@ -8,8 +8,9 @@ demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
 	@echo '`. $(BIN)/activate` puts rbl-gym on the path of this shell.'
 
+# Two workers use both cores; more threads of BLAS would wait for one another.
 test: .venv/dev.stamp
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 # What `test` leaves out: whole recordings, more trials.
 test-long: .venv/dev.stamp
